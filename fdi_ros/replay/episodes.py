@@ -1,10 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What happened in a recording, as values and in words: stretches between gaps, in each the episodes, one per fault.
+"""Events in a recording, as records and in words: stretches between gaps, and one episode per fault.
 
-Each stretch is judged for itself: what was declared or suspected before is forgotten (``Pipeline.reset``), as an
-operator does between two flights. Biases stay: the sensors are the same, and a fault that is still there is to be seen.
+Each stretch is judged separately: declarations and suspicions of the stretch before are cleared
+(``Pipeline.reset``), as an operator does between two flights. Biases are kept, because the sensors
+are the same.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ from fdi_ros.report.layout import FORCES, RADIANS, Unit
 from fdi_ros.system.text import plus_minus
 
 GAP = 10.0
-"""Samples further apart than this are of two stretches, s. Shorter holes are part of one: messages were lost."""
-HOLE = 1.0  # no fault is injected into a longer time without a sample, and no curve is drawn over it, s
+"""Gap between two stretches, s. A shorter hole is within a stretch: messages were lost."""
+HOLE = 1.0
+"""Longest time without samples over which faults are injected and curves are drawn, s."""
 
 
 def pieces(stamp: NDArray[np.int64], longest: float = HOLE) -> list[slice]:
-    """Return the rows of stamps (N,), ns, in pieces without an interval longer than this, s."""
+    """Cut stamps (N,), ns, at intervals longer than ``longest``, s. Return slices of rows."""
     edges = [
         0,
         *(np.flatnonzero(np.diff(stamp) > longest * 1e9) + 1).tolist(),
@@ -35,7 +37,7 @@ def pieces(stamp: NDArray[np.int64], longest: float = HOLE) -> list[slice]:
 
 
 DECLARED = ("FAULTY", "AMBIGUOUS")
-"""States of an episode in which a fault was declared; in one that is STALE channels gave nothing."""
+"""States of an episode with a declared fault. The other state, STALE, means no data."""
 Course = Literal[
     "steady", "growing", "shrinking", "varying", "noisy", "proportional", "gone"
 ]
@@ -43,139 +45,170 @@ Course = Literal[
 
 @dataclass(frozen=True)
 class Size:
-    """The error of one channel while it stood declared, if it alone was wrong."""
+    """Error of one channel while it was declared, if no other channel was wrong."""
 
-    rad_s: float  # with its sign; of what varies or is noise, root mean square
-    std_rad_s: float  # standard error of that: by chance, and by the scale factors and biases that are not known
+    rad_s: float
+    """Signed error, rad/s. Root mean square if the error varies or is noise."""
+    std_rad_s: float
+    """Standard error of `rad_s`, from noise and from unknown scale factors and biases, rad/s."""
     course: Course
-    """steady; growing, shrinking (then the size is that at the declaration); varying; noisy; proportional to the rate
-    along the axis; gone before the end."""
-    last_rad_s: float  # in the last batch
-    slope_rad_s2: float | None = None  # of what grows or shrinks
-    share_of_rate: float | None = (
-        None  # of what is proportional to the rate: an error of the scale factor
-    )
-    gone_s: float | None = (
-        None  # since when it has stayed away, s from the first message
-    )
+    """Course over time. The size of a growing or shrinking error is the one at the declaration.
+    ``proportional``: to the rate along the axis. ``gone``: the error ended before the recording."""
+    last_rad_s: float
+    """Error in the last batch, rad/s."""
+    slope_rad_s2: float | None = None
+    """Slope of a growing or shrinking error, rad/s^2. None: another course."""
+    share_of_rate: float | None = None
+    """Scale error, as a share of the rate. None: another course than ``proportional``."""
+    gone_s: float | None = None
+    """Time at which the error ended, s from the first message. None: another course than ``gone``."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """Who was declared how from a time on, within an episode."""
+    """State of an episode from some time on."""
 
-    at_s: float  # s from the first message
-    state: str  # FAULTY: every one of the channels; AMBIGUOUS: one of them; STALE: they give nothing.
+    at_s: float
+    """Begin of the step, s from the first message."""
+    state: str
+    """FAULTY: all channels are faulty. AMBIGUOUS: one of them is. STALE: they deliver no data."""
     channels: tuple[str, ...]
-    who: str  # the channels in words
+    """Names of the channels."""
+    who: str
+    """The channels in words."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A channel that would explain what was seen, and how large its error then was."""
+    """A channel whose error would explain the evidence."""
 
     channel: str
-    axis: str  # of the body: x, -y, or a direction
-    size: Size | None  # none: the others do not tell
+    """Name of the channel."""
+    axis: str
+    """Its axis in the body frame: x, -y, or a direction."""
+    size: Size | None
+    """Size of the error. None: the other channels do not determine it."""
 
 
 @dataclass(frozen=True)
 class Apart:
-    """Two channels that alone measure one axis, and by how much they differ."""
+    """Difference of the only two channels that measure one axis."""
 
     channels: tuple[str, ...]
-    who: str  # the two in words
+    """Names of the two channels."""
+    who: str
+    """The two channels in words."""
     size: Size
+    """Difference of the two."""
 
 
 @dataclass(frozen=True)
 class RateMeanwhile:
-    """What the fused rate did during an episode."""
+    """The fused rate during an episode."""
 
-    published: float  # share of the samples with a rate
-    std_before_rad_s: (
-        float | None
-    )  # root of the trace of its covariance half a second before; None: there was no rate.
-    std_rad_s: float | None  # the same on average during the episode
-    level_rad_s: (
-        float | None
-    )  # largest protection level of an axis meanwhile; None: there was a sample without one.
+    published: float
+    """Share of the samples with a rate."""
+    std_before_rad_s: float | None
+    """Root of the trace of the covariance half a second before the episode, rad/s. None: no rate."""
+    std_rad_s: float | None
+    """The same on average during the episode, rad/s."""
+    level_rad_s: float | None
+    """Largest protection level of an axis, rad/s. None: a sample had no level."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the declaration rests on."""
+    """Evidence for a declaration."""
 
     reason: str
-    ratio: (
-        float | None
-    )  # largest statistic, as a share of its threshold; None: no sample was judged.
-    alarms: int  # samples with an alarm
-    last_alarm_s: float | None  # last sample with an alarm, s from the first message
+    """Reason in words."""
+    ratio: float | None
+    """Largest statistic, as a multiple of its threshold. None: no sample was judged."""
+    alarms: int
+    """Number of samples with an alarm."""
+    last_alarm_s: float | None
+    """Time of the last alarm, s from the first message."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """A fault as the monitor told of it, from its first declaration on; times in s from the first message."""
+    """One fault, from its first declaration on. Times are in s from the first message."""
 
-    stretch: int  # number of the stretch it lies in, from 1
-    state: str  # what it came to: FAULTY, AMBIGUOUS or STALE
-    channels: tuple[
-        str, ...
-    ]  # all that are FAULTY or STALE; AMBIGUOUS: of which one is, as far as the evidence went.
-    who: str  # the channels in words
+    stretch: int
+    """Number of its stretch, from 1."""
+    state: str
+    """Last state: FAULTY, AMBIGUOUS or STALE."""
+    channels: tuple[str, ...]
+    """All channels that are FAULTY or STALE, or the candidates if the state is AMBIGUOUS."""
+    who: str
+    """The channels in words."""
     start_s: float
-    since_s: float  # since when it has been these channels, in this state
-    end_s: float  # when nothing of it stood any more, or the end of the stretch
-    stands: bool  # it stood at the end of the stretch
-    steps: tuple[Step, ...]  # how it came to that, the last one included
+    """Time of the first declaration, s."""
+    since_s: float
+    """Time since which the episode has had these channels and this state, s."""
+    end_s: float
+    """Time at which the last declaration was withdrawn, or end of the stretch, s."""
+    stands: bool
+    """Whether a declaration stood at the end of the stretch."""
+    steps: tuple[Step, ...]
+    """All steps, the last one included."""
     candidates: tuple[Candidate, ...]
-    """What explains it: the channels above, and how large their errors were; one by one."""
+    """The channels with the sizes of their errors."""
     apart: Apart | None
-    """AMBIGUOUS, where two channels alone measure an axis: the two that surely differ, and by how much."""
+    """If AMBIGUOUS: two channels that alone measure an axis and certainly differ."""
     evidence: Evidence
+    """Evidence for the declaration."""
     rate: RateMeanwhile
-    words: str = ""  # the whole in one sentence
+    """The fused rate during the episode."""
+    words: str = ""
+    """The episode in one sentence."""
     measured_in: str = RADIANS.name
-    """rad/s, or m/s^2 of accelerometers: then sizes and standard deviations are of the specific force."""
-    injected: tuple[str, ...] = ()  # injected faults that explain it
+    """Unit of sizes and standard deviations: rad/s, or m/s^2 for accelerometers."""
+    injected: tuple[str, ...] = ()
+    """Injected faults that explain the episode."""
 
     @property
     def duration_s(self) -> float:
-        """From the first declaration to the end."""
+        """Time from the first declaration to the end, s."""
         return round(self.end_s - self.start_s, 9)
 
     @property
     def declares(self) -> bool:
-        """Whether a fault was declared; otherwise channels only gave nothing."""
+        """Whether a fault was declared. Otherwise the channels only delivered no data."""
         return self.state in DECLARED
 
     @property
     def ever(self) -> frozenset[str]:
-        """Every channel that it was about at some time."""
+        """Channels of all steps."""
         return frozenset(name for step in self.steps for name in step.channels)
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """A part of a recording without a long gap, judged as a recording of its own."""
+    """A part of a recording without a long gap, which is judged separately."""
 
-    start_s: float  # s from the first message
+    start_s: float
+    """Time of the first sample, s from the first message."""
     end_s: float
+    """Time of the last sample, s from the first message."""
     samples: int
-    judged: int  # samples that were judged
-    watched_s: float  # time that was judged while nothing stood declared, s
+    """Number of samples."""
+    judged: int
+    """Number of judged samples."""
+    watched_s: float
+    """Judged time without a standing declaration, s."""
 
 
 @dataclass(frozen=True)
 class Story:
-    """All that happened in a recording."""
+    """Stretches and episodes of a recording."""
 
     stretches: tuple[Stretch, ...]
-    episodes: tuple[
-        Episode, ...
-    ]  # in the order of time; the first ones where there are very many
-    more: int = 0  # episodes beyond these
+    """The stretches in the order of time."""
+    episodes: tuple[Episode, ...]
+    """The episodes in the order of time, at most the first 1000."""
+    more: int = 0
+    """Number of further episodes."""
 
     @property
     def declared(self) -> list[Episode]:
@@ -184,32 +217,36 @@ class Story:
 
     @property
     def gaps(self) -> list[tuple[float, float]]:
-        """Begin and end of what lies between the stretches, s from the first message."""
+        """Begin and end of the gaps between the stretches, s from the first message."""
         return [
             (a.end_s, b.start_s)
             for a, b in zip(self.stretches, self.stretches[1:], strict=False)
         ]
 
 
-NOTHING_HAPPENED = Story((), ())  # of a recording without samples
+NOTHING_HAPPENED = Story((), ())
+"""Story of a recording without samples."""
 
 
-# In words -------------------------------------------------------------------------------------------------------------
+# In words
 
 
-MOST_TOLD = 5  # episodes told of at the top; all are in the tables
-TOO_SMALL = "too small to measure"  # a size that is below its standard error
-FEW_CHANNELS = 3  # sets up to this size are told channel by channel
+MOST_TOLD = 5
+"""Episodes in the summary. The tables have all of them."""
+TOO_SMALL = "too small to measure"
+"""Words for a size below its standard error."""
+FEW_CHANNELS = 3
+"""Largest set that is described channel by channel."""
 
 
 def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
-    """Say how large an error was, with its sign, how sure that is, and what it did; empty: not known."""
+    """Return the size of an error with its standard error and course. Empty: not known."""
     if size is None:
         return ""
     value, std = size.rad_s * unit.factor, size.std_rad_s * unit.factor
     figure = f"{plus_minus(abs(value), std)} {unit.name}"
     if size.course == "proportional":
-        # Two digits, and never -1e+02.
+        # Two significant digits without an exponent.
         share = float(f"{100 * (size.share_of_rate or 0.0):.2g}")
         of = "specific force" if unit == FORCES else "rate"
         return f"{share:+g} % of the {of}, {figure} rms"
@@ -226,7 +263,7 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
 
 
 class _Measured(Protocol):
-    """Something with figures in a unit."""
+    """A record with figures in a unit."""
 
     @property
     def measured_in(self) -> str:
@@ -234,12 +271,12 @@ class _Measured(Protocol):
 
 
 def unit_for(one: _Measured, unit: Unit) -> Unit:
-    """Return the unit for figures of an episode or a channel; ``unit``: that of rates."""
+    """Return the unit for figures of an episode or channel, given the unit of rates."""
     return unit if one.measured_in == RADIANS.name else FORCES
 
 
 def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
-    """Tell of an episode in one sentence, without a full stop."""
+    """Describe an episode in one sentence, without a full stop."""
     unit = unit_for(one, unit)
     until = "" if one.stands else f" to {one.end_s:.3f} s"
     about, before = _about(one, unit), _before(one)
@@ -259,7 +296,7 @@ def _about(one: Episode, unit: Unit) -> str:
     if one.state == "STALE":
         return one.evidence.reason
     if one.apart is not None:
-        # Which of both reads more is no matter where one of them is wrong.
+        # The sign of a difference of two suspects has no meaning.
         apart = replace(
             one.apart.size,
             rad_s=abs(one.apart.size.rad_s),
@@ -321,7 +358,10 @@ def _before(one: Episode) -> str:
 def detail_words(
     one: Episode, unit: Unit = RADIANS, scored: bool = False
 ) -> list[tuple[str, str]]:
-    """Tell the rest of an episode, each line under its title; scored: faults were injected."""
+    """Return the details of an episode as titles and words.
+
+    ``scored``: faults were injected, and the lines name those that explain the episode.
+    """
     unit = unit_for(one, unit)
     injected = (
         [("injected faults", ", ".join(one.injected) or "nothing")] if scored else []
@@ -347,7 +387,7 @@ def detail_words(
 
 
 def _growth(one: Candidate, unit: Unit) -> str:
-    """Say how an error went on that grows or shrinks; nothing of others."""
+    """Describe the growth of an error. Empty: the error neither grows nor shrinks."""
     size = one.size
     if size is None or not size.slope_rad_s2:
         return ""
@@ -359,7 +399,7 @@ def _growth(one: Candidate, unit: Unit) -> str:
 
 
 def _evidence(one: Episode) -> str:
-    """Say what the declaration rests on."""
+    """Describe the evidence for a declaration."""
     words = [one.evidence.reason] if one.evidence.reason else []
     if one.evidence.ratio is not None:
         words.append(f"statistic {one.evidence.ratio:.3g} times its threshold")
@@ -373,7 +413,7 @@ def _evidence(one: Episode) -> str:
 
 
 def _rivals(one: Episode, unit: Unit) -> str:
-    """Say which other channels would explain it as well."""
+    """Name other channels that would explain the evidence."""
     if one.state == "FAULTY":
         return (
             "no other single channel explains the evidence"
@@ -392,7 +432,7 @@ def _rivals(one: Episode, unit: Unit) -> str:
 
 
 def _rate(one: Episode, unit: Unit) -> str:
-    """Say what the fused rate did."""
+    """Describe the fused rate during an episode."""
     rate = one.rate
     if rate.published == 0.0:
         return "not published"
@@ -420,7 +460,7 @@ def _rate(one: Episode, unit: Unit) -> str:
 
 
 def stretch_words(story: Story) -> list[str]:
-    """Tell of the stretches where there are several: each is judged for itself."""
+    """Describe the stretches. Empty: the recording has only one."""
     if len(story.stretches) < 2:
         return []
     lines = []

@@ -1,9 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the channels and units of a recording delivered: messages, finite values, saturation.
+"""Health of channels and units in a recording: messages, finite values, saturation.
 
-All of it is measured on what was recorded, whatever the monitor made of it.
+All figures are measured on the recorded values, independent of the monitor.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ MOST_WINDOWS = 4096
 WINDOW = 1.0
 """Length of a window at first, s."""
 MESSAGES_IN_WINDOW = 20.0
-"""Messages of a unit that a window must hold on average: fewer show no rate."""
+"""Smallest mean number of messages in a window for a rate."""
 USUAL_QUANTILE = 0.9
-"""Quantile of the counts of a unit that is its usual count: a unit may be slow for long."""
+"""Quantile of the counts of a unit that is its usual count, even if the unit is slow for long."""
 SLOW = 0.6
 """Share of the usual count below which a unit is slow."""
 LEAST_SLOW = 3
 """Windows in a row that a unit is slow at least."""
 
 LEAST_RAIL = 4.0
-"""Smallest end of a range, rad/s; gyros of 250 deg/s end at 4.36 rad/s."""
+"""Smallest end of a range, rad/s. Gyros of 250 deg/s end at 4.36 rad/s."""
 LEAST_FORCE_RAIL = 19.0
-"""The same of an accelerometer, m/s^2: those of 2 g end at 19.6 m/s^2."""
+"""Smallest end of a range, m/s^2. Accelerometers of 2 g end at 19.6 m/s^2."""
 RAIL_RUN = 5
 """Consecutive samples at the largest value that show the end of a range."""
 
@@ -56,15 +56,17 @@ class Delivery(NamedTuple):
 
 
 class Deliveries:
-    """Counts the messages of topics in windows of time; memory does not grow with the recording."""
+    """Counts the messages of topics in windows of time, in bounded memory."""
 
     def __init__(self, topics: int, start: float = 0.0) -> None:
         """``start``: time of the first message that is counted, s."""
         self._counts = np.zeros((topics, MOST_WINDOWS), dtype=np.int64)
         self._start = start
         self._width = WINDOW
-        self._first: int | None = None  # time of recording of the first message, ns
-        self._last = 0  # the latest time of recording, ns
+        self._first: int | None = None
+        """Time of recording of the first message, ns."""
+        self._last = 0
+        """Latest time of recording, ns."""
 
     def tap(self, batch: Batch, rows: Int) -> None:
         """Count some rows of a batch of raw messages."""
@@ -89,7 +91,7 @@ class Deliveries:
         # The last window is cut off by the end of the recording.
         length = int((self._last - self._first) * 1e-9 / self._width)
         counts = self._counts[:, :length].astype(np.float64)
-        # Messages of each topic in a window in which it gives any.
+        # Mean number of messages of each topic, in windows with messages.
         usual_count = counts.sum(axis=1) / np.maximum((counts > 0).sum(axis=1), 1)
         together = 1
         while (
@@ -104,7 +106,7 @@ class Deliveries:
             return [Delivery(1.0, None) for _ in counts]
         usual: Array = np.maximum(np.quantile(counts, USUAL_QUANTILE, axis=1), 1.0)
         shares = counts / usual[:, None]
-        # All topics lack what the recorder lost.
+        # Messages that the recorder lost are missing on all topics.
         recorded = shares.max(axis=0)
         shares = shares[:, recorded > 0] / np.maximum(recorded[recorded > 0], 1e-9)
         times: Array = np.asarray(self._start + width * np.flatnonzero(recorded > 0))
@@ -120,7 +122,7 @@ def _delivery(shares: Array, times: Array, width: float, rate: float) -> Deliver
     ``shares`` (k,) of its usual rate in windows that begin at ``times`` (k,) s and last
     ``width`` s. ``rate``: its usual rate, Hz.
     """
-    # Its first window is cut off.
+    # The first window is incomplete.
     begun = int(np.flatnonzero(shares > 0)[0]) + 1
     shares, times = shares[begun:], times[begun:]
     if not len(shares):
@@ -155,7 +157,8 @@ class Values:
     def __init__(self, n: int, quantity: Quantity = RATE) -> None:
         least = LEAST_RAIL if quantity == RATE else LEAST_FORCE_RAIL
         self._largest = np.full(n, least)
-        self._run = np.zeros(n, dtype=np.int64)  # samples in a row at the largest value
+        self._run = np.zeros(n, dtype=np.int64)
+        """(n,) consecutive samples at the largest value."""
         self.samples = 0
         """Samples so far."""
         self.finite: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
@@ -164,7 +167,7 @@ class Values:
         """(n,) samples in runs at the largest value of the channel."""
 
     def add(self, block: Block) -> None:
-        """Take in the next samples."""
+        """Add the next samples."""
         if not len(block):
             return
         known = np.isfinite(block.z)

@@ -1,9 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What came of injected faults, in one vocabulary for replay, sweep, fleet and studies; and counts of many trials.
+"""Results for injected faults, with the same terms in replay, sweep, fleet and studies.
 
-A replay follows the changes of state (`Evaluation`), a sweep and a study have the states of all samples (`score`).
+A replay follows the changes of state (`Evaluation`). A sweep and a study have the states of all
+samples (`score`).
 """
 
 from __future__ import annotations
@@ -25,29 +26,31 @@ from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.replay.episodes import DECLARED
 
-ALONE = (
-    ChannelState.FAULTY,
-    ChannelState.STALE,
-)  # states by which a channel is declared by itself
+ALONE = (ChannelState.FAULTY, ChannelState.STALE)
+"""States of a channel that is declared alone."""
 STANDING = (*ALONE, ChannelState.AMBIGUOUS)
+"""States of a declared channel, alone or in a set."""
 
 
 class OutcomeKind(str, Enum):
-    """What came of one injected fault; the values are the words of the files that hold outcomes."""
+    """Result for one injected fault. The values appear in files."""
 
-    ISOLATED = "named"  # the faulty channel was declared by itself
-    AMBIGUOUS = (
-        "in a set"  # it was one of an ambiguity group, and not declared by itself
-    )
-    MISSED = "silent"  # nothing was declared
-    FALSE_GROUP = "false set"  # only groups without it were declared
-    FALSE_ISOLATION = "wrong"  # a healthy channel was declared by itself
+    ISOLATED = "named"
+    """The faulty channel was declared alone."""
+    AMBIGUOUS = "in a set"
+    """The faulty channel was declared in a set only."""
+    MISSED = "silent"
+    """Nothing was declared."""
+    FALSE_GROUP = "false set"
+    """Only sets without the faulty channel were declared."""
+    FALSE_ISOLATION = "wrong"
+    """A healthy channel was declared alone."""
 
 
 def outcome_of(
     false_isolation: bool, isolated: bool, in_set: bool, false_group: bool
 ) -> OutcomeKind:
-    """Return what came of a fault: a healthy channel that was declared counts more than that it was found."""
+    """Return the result for a fault. A wrong isolation outweighs a right one."""
     if false_isolation:
         return OutcomeKind.FALSE_ISOLATION
     if isolated:
@@ -58,19 +61,18 @@ def outcome_of(
 
 
 class Scored(NamedTuple):
-    """What came of one fault, and when."""
+    """Result for one fault, with times."""
 
     outcome: OutcomeKind
-    isolated_after: (
-        float  # until the channel was declared by itself, s; inf: it was not
-    )
-    detected_after: (
-        float  # until it was declared by itself or in a group, s; inf: it was not
-    )
+    """The result."""
+    isolated_after: float
+    """Time until the channel was declared alone, s. Infinite: never."""
+    detected_after: float
+    """Time until the channel was declared alone or in a set, s. Infinite: never."""
 
 
 def standing(output: Output) -> tuple[Mask, Mask]:
-    """(N, n) whether a channel stands declared by itself, or silent; and whether it stands in an ambiguity group."""
+    """Return whether each channel is declared alone or silent, and in a set, (N, n) each."""
     return np.isin(output.state, ALONE), np.asarray(
         output.state == ChannelState.AMBIGUOUS
     )
@@ -79,10 +81,18 @@ def standing(output: Output) -> tuple[Mask, Mask]:
 def score(
     alone: Mask, among: Mask, channel: int | None, since: Array, within: float = np.inf
 ) -> Scored:
-    """Say what came of a fault of a channel (None: none is faulty); ``alone`` and ``among`` (N, n) as of `standing`.
+    """Return the result for a fault.
 
-    ``since`` (N,) s from the start of the fault. It is isolated, or in a group, if it is so ``within`` so many s; a
-    false isolation counts at any time.
+    Parameters
+    ----------
+    alone, among
+        (N, n) states, as `standing` returns them.
+    channel
+        Index of the faulty channel. None: all channels are healthy.
+    since
+        (N,) time from the start of the fault, s.
+    within
+        Time in which an isolation or a set counts, s. A wrong isolation counts at any time.
     """
     own = [] if channel is None else [channel]
     others, soon = np.delete(alone, own, axis=1), since <= within
@@ -105,44 +115,51 @@ def _first(declared: Mask, since: Array) -> float:
     return float(since[rows[0]]) if len(rows) else np.inf
 
 
-# Changes of state, and what they make of each fault ------------------------------------------------------------------
+# Changes of state, and the results for each fault
 
 
-UNCHECKED_STATES = (
-    "STALE",
-    "UNCHECKED",
-)  # states of a channel that nothing checks, and that no fault was declared of
+UNCHECKED_STATES = ("STALE", "UNCHECKED")
+"""States of a channel that no other channel checks, without a declared fault."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one injected fault; times in s from the first message."""
+    """Result for one injected fault. Times are in s from the first message."""
 
-    channel: str  # As it was asked for: one name, or several separated by commas.
-    channels: tuple[str, ...]  # Names of the channels that it is injected into.
+    channel: str
+    """Channel as the user wrote it: one name, or several with commas between."""
+    channels: tuple[str, ...]
+    """Names of the channels with the fault."""
     kind: str
-    size: float | None  # In the unit of the kind's option; None: the kind has no size.
+    """Kind of the fault."""
+    size: float | None
+    """Size, in the unit of the kind's option. None: the kind has no size."""
     start_s: float
-    stop_s: float | None  # None: it lasts to the end.
-    detected_at_s: float | None = (
-        None  # Of the first declaration that names one of its channels.
-    )
-    delay_s: float | None = None  # From its start to its detection, s.
-    detected_as: str | None = None  # State that the first declaration brought.
-    isolated: bool = False  # All its channels were declared, each by itself.
+    """Start of the fault, s."""
+    stop_s: float | None
+    """End of the fault, s. None: the fault lasts to the end of the recording."""
+    detected_at_s: float | None = None
+    """Time of the first declaration of one of its channels, s. None: not detected."""
+    delay_s: float | None = None
+    """Time from the start to the detection, s."""
+    detected_as: str | None = None
+    """State after the first declaration."""
+    isolated: bool = False
+    """Whether all its channels were declared faulty, each one alone."""
     isolated_at_s: float | None = None
+    """Time of the isolation, s."""
     isolation_delay_s: float | None = None
+    """Time from the start to the isolation, s."""
     declared_channels: tuple[str, ...] = ()
-    """Named by its first declaration, and those of its channels that were named by themselves later."""
+    """Channels of the first declaration, and faulty channels that were declared alone later."""
     declared_before: bool = False
-    """All its channels were declared already when it began: there is nothing left to be detected."""
-    outcome: str = (
-        OutcomeKind.MISSED.value
-    )  # As a sweep has it: one of `fdi_ros.replay.outcomes.OutcomeKind`.
+    """Whether all its channels were already declared when the fault began."""
+    outcome: str = OutcomeKind.MISSED.value
+    """Value of `OutcomeKind`, as in a sweep."""
 
     @property
     def other_channels(self) -> list[str]:
-        """Channels that were named with the fault and that it is not injected into."""
+        """Declared channels without this fault."""
         return [name for name in self.declared_channels if name not in self.channels]
 
 
@@ -151,24 +168,30 @@ class StateChange:
     """A change of the state of a channel."""
 
     channel: str
-    at_s: float  # s from the first message.
-    state: str  # After the change.
+    """Name of the channel."""
+    at_s: float
+    """Time, s from the first message."""
+    state: str
+    """State after the change."""
     before: str
+    """State before the change."""
     reason: str
-    group: tuple[
-        str, ...
-    ]  # Channels of which one is faulty; the channel itself where it is declared by itself.
-    error: float | None  # Estimated error of the channel; None: the method gives none.
-    measured_in: str = RATE.unit  # Unit of the error: rad/s, of an accelerometer m/s^2.
+    """Reason in words. Empty: none."""
+    group: tuple[str, ...]
+    """Channels of which one is faulty, or only this channel if it is declared alone."""
+    error: float | None
+    """Estimated error of the channel. None: the method estimates none."""
+    measured_in: str = RATE.unit
+    """Unit of the error: rad/s, or m/s^2 for an accelerometer."""
 
     @property
     def declares(self) -> bool:
-        """Whether this is a declaration: the channel is faulty, or one of a set is."""
+        """Whether the change declares a fault of the channel, or of one of a set."""
         return self.state in DECLARED
 
     @property
     def named(self) -> tuple[str, ...]:
-        """The channels that it is about: the one, or all of the set."""
+        """The channel, or all channels of the set."""
         return (
             tuple(dict.fromkeys((self.channel, *self.group)))
             if self.state == "AMBIGUOUS"
@@ -178,37 +201,49 @@ class StateChange:
 
 @dataclass(frozen=True)
 class FaultEffect:
-    """Root mean square of what the injected faults did to the fused rate, rad/s; None: no sample to take it of."""
+    """Root mean square effect of the injected faults on the rate, rad/s. None: no sample."""
 
     before_detection: float | None = None
+    """Effect on the fused rate before the detection, rad/s."""
     after_detection: float | None = None
-    without_monitor: float | None = None  # To the least-squares rate of all channels.
+    """Effect on the fused rate after the detection, rad/s."""
+    without_monitor: float | None = None
+    """Effect on the least-squares rate of all channels, rad/s."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """What was injected against what was declared."""
+    """Injected faults against declarations."""
 
     samples: int
+    """Number of samples."""
     duration_s: float
+    """Time from the first sample to the last, s."""
     faults: tuple[Outcome, ...]
+    """Results for the injected faults."""
     declared: tuple[StateChange, ...]
-    """Declarations that no injected fault explains; all of them where none is injected."""
+    """Declarations that no injected fault explains."""
     fault_effect_rad_s: FaultEffect
-    start_s: float  # Of the first sample, s from the first message.
+    """Effect of the faults on the rate, rad/s."""
+    start_s: float
+    """Time of the first sample, s from the first message."""
     samples_judged: int
+    """Number of judged samples."""
     samples_with_rate: int
-    alarms: int  # Samples with an alarm.
+    """Number of samples with a fused rate."""
+    alarms: int
+    """Number of samples with an alarm."""
     events: tuple[StateChange, ...]
+    """All changes of state."""
 
     @property
     def end_s(self) -> float:
-        """Of the last sample, s from the first message."""
+        """Time of the last sample, s from the first message."""
         return self.start_s + self.duration_s
 
     @property
     def struck(self) -> set[str]:
-        """Channels that a fault is injected into."""
+        """Channels with an injected fault."""
         return {name for fault in self.faults for name in fault.channels}
 
     @property
@@ -217,16 +252,18 @@ class Scores:
         return sum(fault.isolated for fault in self.faults)
 
 
-GRACE = 1.0  # a declaration this long after the stop of a fault is attributed to it, s
-SQUARED = 1e150  # squares of anything smaller are finite, and so are sums of very many
+GRACE = 1.0
+"""Time after the end of a fault in which a declaration is still attributed to the fault, s."""
+SQUARED = 1e150
+"""Values below this have finite squares, and finite sums of squares."""
 _UNCHECKED = np.isin(
     np.arange(len(ChannelState)), [ChannelState[name] for name in UNCHECKED_STATES]
 )
-"""By state, whether nothing checks a channel."""
+"""Whether a channel is unchecked, by its state."""
 
 
 class Followed:
-    """One injected fault, the numbers of the channels that it is injected into, and what has become of it so far."""
+    """One injected fault, the indices of its channels, and its result so far."""
 
     def __init__(
         self, fault: Fault, channels: Sequence[int], names: Sequence[str]
@@ -241,28 +278,25 @@ class Followed:
             fault.start,
             finite(fault.stop),
         )
-        self.detected_stamp: int | None = (
-            None  # of the first declaration that names one of its channels, ns
-        )
-        self._declared: dict[
-            str, bool
-        ] = {}  # channels that were declared, and whether by themselves
-        self.false: set[str] = (
-            set()
-        )  # states in which healthy channels were declared while it lasted
+        self.detected_stamp: int | None = None
+        """Stamp of the first declaration of one of its channels, ns."""
+        self._declared: dict[str, bool] = {}
+        """Declared channels, and whether each was declared alone."""
+        self.false: set[str] = set()
+        """States in which healthy channels were declared during the fault."""
 
     def explains(self, since: float, channels: Collection[str]) -> bool:
-        """Whether the fault is a reason for a declaration of some channels, or of one of them, at a time, s."""
+        """Whether the fault explains a declaration of some channels at a time, s."""
         return self.is_active(since) and not set(channels).isdisjoint(
             self.outcome.channels
         )
 
     def is_active(self, since: float) -> bool:
-        """Whether what is declared at a time, s, may come of the fault."""
+        """Whether the fault can cause a declaration at a time, s."""
         return self.fault.start <= since < self.fault.stop + GRACE
 
     def add(self, stamp: int, change: StateChange) -> None:
-        """Take in a declaration that this fault explains."""
+        """Add a declaration that this fault explains."""
         own, at, delay = (
             self.outcome,
             change.at_s,
@@ -274,7 +308,7 @@ class Followed:
                 own, detected_at_s=at, delay_s=delay, detected_as=change.state
             )
         for name in change.named:
-            # Other channels that are named later have reasons of their own.
+            # Later declarations of other channels have other reasons.
             if stamp == self.detected_stamp or name in own.channels:
                 self._declared.setdefault(name, False)
         if change.state != "AMBIGUOUS":
@@ -288,7 +322,7 @@ class Followed:
         self.outcome = replace(own, declared_channels=tuple(self._declared))
 
     def result(self) -> Outcome:
-        """Return what has become of it."""
+        """Return the result so far."""
         false, found = self.false, self.detected_stamp is not None
         kind = outcome_of(
             "FAULTY" in false, self.outcome.isolated, found, "AMBIGUOUS" in false
@@ -302,7 +336,7 @@ class Evaluation:
     def __init__(
         self, injector: Injector, geometry: Geometry, names: Sequence[str] = ()
     ) -> None:
-        """``geometry``: of the gyros. ``names``: of all channels; empty: of the gyros."""
+        """``geometry``: axes of the gyros. ``names``: names of all channels. Empty: the gyros."""
         self.injector = injector
         self.names = tuple(names) or geometry.channel_names
         n = len(self.names)
@@ -311,31 +345,32 @@ class Evaluation:
             Followed(fault, channels, self.names) for fault, channels in pairs
         ]
         self.events: list[StateChange] = []
-        self.samples, self._counts = (
-            0,
-            np.zeros(3, dtype=np.int64),
-        )  # those judged, with a rate, with an alarm
+        self.samples = 0
+        self._counts = np.zeros(3, dtype=np.int64)
+        """Numbers of samples that were judged, had a rate, had an alarm."""
         self.without_rate = 0
         """Number of samples without a fused rate after the first one with a rate."""
         self.without_rate_from: float | None = None
         """Time of the first of these samples, s from the first message."""
         self._has_had_rate = False
         self._unexplained: list[StateChange] = []
-        self._unchecked = np.zeros(n)  # samples in which nothing checked the channel
+        self._unchecked = np.zeros(n)
+        """Number of samples in which each channel was unchecked."""
         self._residuals = np.zeros((2, n))
-        """Of each channel while it is OK: sum of the squared residuals, and their number."""
+        """Sum of squared residuals and their number, for each channel while OK."""
         self._least_squares = geometry.least_squares
         self._state = [ChannelState.OK] * n
         self._declared: dict[int, ChannelState] = {}
         self._first: int | None = None
-        self.last = 0  # stamp of the last sample, ns
+        self.last = 0
+        """Stamp of the last sample, ns."""
         self._effects = np.zeros((2, 3))
-        """Of the faults before and after detection, and without a monitor: sum of the squares, and their number."""
+        """Sum of squares and number of the effects before detection, after, and without a monitor."""
 
     def add(self, output: Output, clean: Array | None = None) -> None:
-        """Take in the next samples.
+        """Add the next samples.
 
-        ``clean`` (N, 3): what the same monitor fuses of them without the faults, rad/s; NaN: not to be compared.
+        ``clean`` (N, 3): rate that the monitor fuses without the faults, rad/s. NaN: not compared.
         """
         if len(output) == 0:
             return
@@ -390,30 +425,30 @@ class Evaluation:
         self.without_rate += len(rows)
 
     def add_unmonitored(self, faulty: Block, healthy: Block) -> None:
-        """Take in what the faults do to the plain least-squares rate of all channels; NaN: not to be compared."""
+        """Add the effect on the least-squares rate of all channels. NaN: not compared."""
         rows = self.injector.active(faulty.stamp).any(axis=1)
         if rows.any():
-            # What is recorded may be infinite.
+            # A recording may contain infinite values.
             with np.errstate(invalid="ignore", over="ignore"):
                 effect = (faulty.z[rows] - healthy.z[rows]) @ self._least_squares.T
             self._add_effect(2, effect)
 
     def _add_effect(self, which: int, effect: Array) -> None:
-        """Take in errors (k, 3) of the rate; one that is not finite, or too large to be squared, does not count."""
+        """Add errors (k, 3) of the rate that are finite and not too large."""
         effect = effect[(np.abs(effect) < SQUARED).all(axis=1)]
         self._effects[:, which] += float((effect**2).sum()), len(effect)
 
     def time(self, stamp: int) -> float:
-        """Seconds from the first message to a stamp, ns."""
+        """Return the time of a stamp, ns, in s from the first message."""
         return float(self.injector.time(np.array([stamp]))[0])
 
     def begin_stretch(self) -> None:
-        """Nothing stands declared any more."""
+        """Clear all declarations."""
         self._state = [ChannelState.OK] * len(self.names)
         self._declared = {}
 
     def _begin(self, time: float) -> None:
-        """Note the faults that have begun up to this time, s: before what the sample of this time brings."""
+        """Mark the faults that began up to a time, s, before the sample of this time is scored."""
         for one in self.faults:
             if not one.begun and one.fault.start <= time:
                 before = all(self._state[i] in ALONE for i in one.channels)
@@ -441,7 +476,7 @@ class Evaluation:
             event.after not in STANDING
             or self._declared.get(event.channel) == event.after
         ):
-            # What is declared already and was only hidden for a while (the channel gave nothing) is not declared anew.
+            # A declared channel that was silent for a while is not declared anew.
             return
         if event.declares:
             self._declared[event.channel] = event.after
@@ -455,16 +490,16 @@ class Evaluation:
 
     @property
     def unchecked(self) -> Array:
-        """(n,) share of the samples in which nothing checked a channel."""
+        """(n,) share of the samples in which each channel was unchecked."""
         return self._unchecked / max(1, self.samples)
 
     @property
     def residual_rms(self) -> list[float | None]:
-        """Of each channel while OK, rad/s; None: it never was."""
+        """Root mean square residual of each channel while OK, rad/s. None: never OK."""
         return [rms(*one) for one in self._residuals.T.tolist()]
 
     def scores(self) -> Scores:
-        """Return the figures."""
+        """Return the scores so far."""
         first = self.last if self._first is None else self._first
         judged, with_rate, alarms = self._counts.tolist()
         return Scores(
@@ -484,18 +519,19 @@ class Evaluation:
 
 
 def rms(squares: float, count: float) -> float | None:
-    """Root mean square of a sum of squares; None of nothing."""
+    """Return the root mean square of a sum of squares. None: no value."""
     return math.sqrt(squares / count) if count else None
 
 
-# Counts of trials, which add up whatever blocks they come from, and the estimates made of them ------------------------
+# Counts of trials, which add up over blocks, and estimates from counts
 
 
-Z95 = 1.959963984540054  # normal quantile of a two-sided 95 % interval
+Z95 = 1.959963984540054
+"""Normal quantile of a two-sided 95 % interval."""
 
 
 def added(a: Any, b: Any) -> Any:
-    """Sum of what two blocks of trials give: numbers, None, and lists or mappings of these, added item by item."""
+    """Add the results of two blocks of trials: numbers, None, lists and mappings, item by item."""
     if a is None:
         return b
     if isinstance(a, Mapping):
@@ -507,7 +543,7 @@ def added(a: Any, b: Any) -> Any:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure with its 95 % interval; a value of NaN: no trials."""
+    """A figure with its 95 % interval. NaN: no trials."""
 
     value: float
     low: float
@@ -515,7 +551,10 @@ class Estimate:
 
 
 def share(count: float, trials: float, z: float = Z95) -> Estimate:
-    """Share of trials with its 95 % interval (Wilson 1927); effective numbers need not be whole; z: the quantile."""
+    """Return a share of trials with its 95 % interval (Wilson 1927).
+
+    Numbers need not be whole. ``z``: normal quantile of the interval.
+    """
     if trials == 0:
         return Estimate(math.nan, 0.0, 1.0)
     p = count / trials
@@ -528,7 +567,7 @@ def share(count: float, trials: float, z: float = Z95) -> Estimate:
 
 
 def mean_of(total: float, squares: float, count: int) -> Estimate | None:
-    """Mean with its 95 % interval from a sum and a sum of squares; None if there is nothing to average."""
+    """Return the mean with its 95 % interval from a sum and a sum of squares. None: no value."""
     if count == 0:
         return None
     mean = total / count
@@ -537,7 +576,10 @@ def mean_of(total: float, squares: float, count: int) -> Estimate | None:
 
 
 def quantiles(histogram: Mapping[str, int]) -> dict[str, int | None]:
-    """Median and more of whole numbers counted as ``{"number": count}``; None if there are none."""
+    """Return median and other quantiles of whole numbers, counted as ``{"number": count}``.
+
+    None: no number.
+    """
     counts = sorted((int(number), count) for number, count in histogram.items())
     reached = list(accumulate(count for _, count in counts))
     found: dict[str, int | None] = {}
@@ -552,5 +594,5 @@ def quantiles(histogram: Mapping[str, int]) -> dict[str, int | None]:
 
 
 def finite(value: float) -> float | None:
-    """Return a value, or None where it is not finite."""
+    """Return a value, or None if the value is not finite."""
     return value if math.isfinite(value) else None

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a replay writes as it goes: a line for every sample; a bag of what the node would have published."""
+"""Files that a replay writes: a table of all samples, and a bag with the messages of the node."""
 
 from __future__ import annotations
 
@@ -38,10 +38,11 @@ _STATES = np.array([state.name for state in ChannelState])
 
 
 class CsvFile(Sink):
-    """A table of all samples, in a file open for writing text.
+    """A table of all samples, in a file that is open for text.
 
-    The columns: stamp, ns; fused rate and its standard deviation, rad/s; statistic, threshold, alarm; then of every
-    channel what came in, its residual, and its state; rad/s, of accelerometers m/s^2. Empty where there is nothing.
+    Columns: stamp, ns. Fused rate and its standard deviation, rad/s. Statistic, threshold, alarm.
+    Then measured value, residual and state of each channel, in rad/s, or m/s^2 for accelerometers.
+    Unknown values are empty.
     """
 
     def __init__(self, file: TextIO) -> None:
@@ -49,7 +50,7 @@ class CsvFile(Sink):
         self._begun = False
 
     def _begin(self, names: Sequence[str]) -> None:
-        """Write the head, for channels of these names."""
+        """Write the head for channels with these names."""
         self._begun = True
         head = [
             "stamp",
@@ -102,32 +103,37 @@ def _text(value: float) -> str:
     return "" if value != value else repr(value)
 
 
-NODE = "/fdi_node"  # what ``~`` stands for: the node as it is called by default, in no namespace
+NODE = "/fdi_node"
+"""Default name of the node, which replaces ``~``."""
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 class OutputBag(Sink):
-    """A rosbag2 folder with one MCAP file, as `ros2 bag record` would leave it beside the running node.
+    """A rosbag2 folder with one MCAP file, as `ros2 bag record` writes beside a running node.
 
     The folder must not exist.
     """
 
     stops_at_events = True
-    period = 1_000_000_000  # of the regular diagnostics, ns
+    #: period of the regular diagnostics, ns
+    period = 1_000_000_000
 
     def __init__(self, path: Path, config: Config) -> None:
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
-        # By this it may be replaced later: what anything else has recorded never is.
+        # This mark allows a later run to replace the bag. Other recordings are never replaced.
         self._writer.set_custom_data(MADE_BY_FDI, __version__)
         self._frame = config.body_frame
-        self._encoder: Encoder | None = None  # from the first samples on
+        self._encoder: Encoder | None = None
+        """Encoder of the messages. None: no sample yet."""
         self._source = source_of(config)
         self._before: list[tuple[Newest, dict[str, int]]] = [
             (Newest(), {}) for _ in config.topics
         ]
         self._health = RecentHealth()
-        self._shift = 0  # stamp of a sample minus that of its message, ns
-        self._later = 0  # time of recording minus stamp, ns: what is written stands beside the message that brought it
+        self._shift = 0
+        """Stamp of a sample minus the stamp of its message, ns."""
+        self._later = 0
+        """Time of recording minus stamp, ns, so that outputs lie beside their inputs."""
 
     def __enter__(self) -> OutputBag:
         self._writer.open()
@@ -142,7 +148,7 @@ class OutputBag(Sink):
         self._writer.__exit__(*error)
 
     def tap(self, batch: Batch, rows: Int) -> None:
-        """Copy the messages that are used."""
+        """Copy the used messages."""
         for k in rows.tolist():
             self._writer.write(
                 self._inputs[int(batch.topic[k])],
@@ -151,13 +157,13 @@ class OutputBag(Sink):
             )
 
     def begin(self, samples: Samples) -> None:
-        """Note how stamps and times of recording differ."""
+        """Store the difference of stamps and times of recording."""
         newest = max(samples.newest, key=lambda topic: topic.log_time)
         self._shift = samples.alignment.shift
         self._later = newest.log_time - newest.stamp - self._shift
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
-        """Write what the node would have published of these samples."""
+        """Write the messages that the node would have published."""
         if self._encoder is None:
             names, n = pipeline.channel_names, pipeline.geometry.n
             self._encoder = Encoder(self._frame, names, n)
@@ -167,7 +173,7 @@ class OutputBag(Sink):
             self._diagnose(pipeline, self._time(int(output.stamp[-1])), ())
 
     def tick(self, samples: Samples, pipeline: Pipeline) -> None:
-        """Write the regular diagnostics: once a second of the recording."""
+        """Write the regular diagnostics, once per second of the recording."""
         now = max(topic.log_time for topic in samples.newest)
         inputs = [
             self._input_status(k, samples, now) for k in range(len(samples.topics))
@@ -176,7 +182,7 @@ class OutputBag(Sink):
         self._diagnose(pipeline, now, inputs)
 
     def _input_status(self, k: int, samples: Samples, now: int) -> InputStatus:
-        """Describe a topic after the messages read so far, by the clock of the recorder."""
+        """Return the state of a topic after the messages so far, by the clock of the recorder."""
         source, newest, topic = self._source, samples.newest[k], samples.topics[k]
         counts = {"malformed": samples.malformed[topic]}
         if source.stamped:
@@ -209,11 +215,11 @@ class OutputBag(Sink):
         )
 
     def _time(self, stamp: int) -> int:
-        """Time of recording for a sample, ns; stamps of messages may lie anywhere, times of recording may not."""
+        """Return the time of recording for a sample, ns. Unlike stamps, it must be plausible."""
         return min(max(stamp + self._later, 0), LATEST)
 
     def _topic(self, name: str, kind: str) -> Connection:
-        """Add a topic, called as by the node where nothing is remapped."""
+        """Add a topic with its name without remapping."""
         name = (
             name.replace("~", NODE, 1)
             if name.startswith("~")

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of a replay: the outputs of the monitor, the states of the channels and the marks of faults over time."""
+"""The page of a replay: outputs of the monitor, states of the channels and marks of faults over time."""
 
 from __future__ import annotations
 
@@ -53,17 +53,22 @@ from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.system import there
 from fdi_ros.system.text import date_of
 
-SEES_AXIS = 0.3  # share of a body axis in a channel's own axis from which on the channel's reading of it is shown
-LOG_FROM = 10.0  # a statistic that exceeds its threshold by more is shown on a logarithmic scale
+SEES_AXIS = 0.3
+"""Smallest component of a channel's axis along a body axis for its curve to be drawn there."""
+LOG_FROM = 10.0
+"""Ratio of statistic to threshold from which on the scale is logarithmic."""
 _AXES = "xyz"
 _INK = "var(--text)"
-MOST_ROWS = 1000  # of the table of events; the first ones
-MOST_CARDS = 200  # episodes shown; JSON has all.
-SHOWN_AROUND = 2.0  # what the link of an episode shows before and after it, at least, s
+MOST_ROWS = 1000
+"""Largest number of rows in the table of events."""
+MOST_CARDS = 200
+"""Largest number of episodes on the page. The JSON file has all."""
+SHOWN_AROUND = 2.0
+"""Least time that the link of an episode shows before and after the episode, s."""
 
 
 class Words(NamedTuple):
-    """Titles of what is drawn of gyros or of accelerometers."""
+    """Titles of the plots of gyros or accelerometers."""
 
     vector: str
     statistic: str
@@ -133,7 +138,7 @@ class Curves:
         self._peaks = np.zeros(2)
 
     def columns(self, output: Output) -> Array:
-        """Return the values of its series, (N, c), and note the largest."""
+        """Return the values of the series, (N, c), and store the largest statistic."""
         deviation = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
         vectors = [output.rate, deviation, output.level, output.residual]
         judged = np.column_stack([output.statistic, output.threshold])
@@ -198,7 +203,7 @@ class Curves:
         ]
 
     def _rate(self, k: int, layout: Mapping[str, Any]) -> Figure:
-        """Draw the fused vector about an axis, and what the channels that see it make of it."""
+        """Draw the fused vector along an axis, with the readings of the channels that measure it."""
         rate, axis = f"rate.{_AXES[k]}", _AXES[k]
         band = {
             "type": "band",
@@ -230,7 +235,7 @@ class Curves:
         width: float | None = None,
         **more: Any,
     ) -> dict[str, Any]:
-        """Draw one of its series."""
+        """Draw one series."""
         look = {"color": colour, **({} if width is None else {"width": width}), **more}
         packed = f"{self._own}{series}"
         return {"type": "scatter", "packed": packed, "name": name, "line": look}
@@ -256,15 +261,16 @@ class Report(Sink):
         self._curves = [Curves(geometry, rate, unit)]
         self._store = PageStore(self._curves[0].kinds)
         self._first_states: list[str] = []
-        self._origin: int | None = None  # stamp that times count from, ns
+        self._origin: int | None = None
+        """Stamp of time zero, ns. None: no sample yet."""
         self._last = 0.0
 
     def begin(self, samples: Samples) -> None:
-        """Note when the recording began: times count from there."""
+        """Store the stamp of the first message, from which times count."""
         self._origin = samples.origin
 
     def begin_stretch(self) -> None:
-        """Break the curves: nothing is recorded between the last sample and the next."""
+        """Break the curves at a gap in the recording."""
         for curves in self._curves:
             if curves.spectrum:
                 curves.spectrum.begin_stretch()
@@ -273,7 +279,7 @@ class Report(Sink):
         )
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
-        """Take in the next samples."""
+        """Add the next samples."""
         if not len(output):
             return
         if not self._first_states:
@@ -284,7 +290,7 @@ class Report(Sink):
         halves = list(zip(self._curves, output.halves, strict=True))
         time = np.asarray((output.stamp - (self._origin or 0)) * 1e-9)
         columns = np.column_stack([curves.columns(half) for curves, half in halves])
-        # Curves also break where samples are missing for a while within a stretch.
+        # Curves also break at holes within a stretch.
         holes = np.flatnonzero(np.diff(time, prepend=self._last or time[0]) > HOLE)
         for k, part in enumerate(np.split(np.arange(len(time)), holes)):
             if k:
@@ -306,9 +312,9 @@ class Report(Sink):
         self._store = PageStore(self._curves[0].kinds | self._curves[1].kinds)
 
     def html(self, summary: Summary, about: Mapping[str, str]) -> str:
-        """Lay out the page: the verdict, the picture, the episodes, other plots, the tables; about: what was run."""
+        """Lay out the page: verdict, episodes, plots and tables. ``about``: head of the page."""
         scores, story, unit = summary.scores, summary.story, self._unit
-        # Shaded are the times of injected faults, and those between stretches, where nothing is recorded.
+        # Injected faults and gaps in the recording are shaded.
         times = [("fault", fault.start_s, fault.stop_s) for fault in scores.faults]
         times += [("gap", begin, end) for begin, end in story.gaps]
         shapes = [
@@ -318,7 +324,7 @@ class Report(Sink):
         common = {"shapes": shapes, "marks": _marks(scores.faults, story.episodes)}
         scale = {"robust": True, "needed": _in_view(scores.faults, story.episodes)}
         said = _autopilot_marks(summary)
-        # Words are read best where little else is.
+        # The first section has few plots, so that its text is read.
         quiet = {
             **common,
             "marks": [*common["marks"], *({**mark, "label": ""} for mark in said)],
@@ -379,7 +385,7 @@ class Report(Sink):
 
 
 def _channel_section(summary: Summary, unit: Unit) -> Section:
-    """Lay out the channels as they are at the end."""
+    """Lay out the channels at the end."""
 
     def figure(one: ChannelResult, value: float | None, form: str) -> str:
         if one.measured_in == RADIANS.name:
@@ -413,7 +419,7 @@ def _channel_section(summary: Summary, unit: Unit) -> Section:
 def _episode_section(
     story: Story, scored: bool, unit: Unit, origin: int | None
 ) -> Section:
-    """Lay out the episodes, a card each: its sentence, a link to its time in the plots, what else is known of it."""
+    """Lay out the episodes as cards with a sentence, a link to the plots, and details."""
     if not story.episodes:
         return Section(
             "What happened", "", ["Nothing was declared, and no channel fell silent."]
@@ -500,13 +506,15 @@ def _plot(
     }
 
 
-# States and marks over time ------------------------------------------------------------------------------------------
+# States and marks over time
 
 
-MOST_CHANGES = 2000  # changes of state shown at most
-MOST_MARKS = 200  # declarations marked at most
+MOST_CHANGES = 2000
+"""Largest number of changes of state in the plot."""
+MOST_MARKS = 200
+"""Largest number of marked declarations."""
 IN_VIEW = 1.0
-"""What residuals do so long after the begin of a fault, and after its detection, is not left off the scale, s."""
+"""Time after the begin and the detection of a fault that the scale of residuals covers, s."""
 STATES = {
     "OK": ("#8fbf9f", ""),
     "SUSPECT": ("#e6c84f", "slashes"),
@@ -525,7 +533,10 @@ def _timeline(
     summary: Summary,
     more: Mapping[str, Any],
 ) -> Figure:
-    """Draw the states of the channels, a row each; first: those with the first sample, empty: none came."""
+    """Draw the states of the channels, one row each.
+
+    ``first``: states at the first sample. Empty: no sample.
+    """
     scores, holes = summary.scores, summary.story.gaps
     begin, end = scores.start_s, max(scores.end_s, scores.start_s + 1e-9)
     current = {
@@ -571,7 +582,7 @@ def _timeline(
 def _recorded(
     since: float, until: float, holes: Sequence[tuple[float, float]]
 ) -> list[tuple[float, float]]:
-    """Parts of a time, s, that are recorded."""
+    """Return the recorded parts of a span of time, s."""
     parts = []
     for begin, end in holes:
         if since < end and begin < until:
@@ -584,7 +595,7 @@ def _recorded(
 def _in_view(
     faults: Sequence[Outcome], episodes: Sequence[Episode]
 ) -> list[list[float]]:
-    """Return times, s, that scales must cover: when faults begin and are detected, and when episodes come to a name."""
+    """Return the times, s, that scales must cover: begin and detection of faults, and declarations."""
     times = [
         time
         for fault in faults
@@ -598,7 +609,7 @@ def _in_view(
 def _marks(
     faults: Sequence[Outcome], episodes: Sequence[Episode]
 ) -> list[dict[str, Any]]:
-    """Mark when injected faults were detected and isolated, and episodes that no injected fault explains."""
+    """Return marks for detections, isolations, and episodes without an injected fault."""
     found: list[tuple[float | None, str, str, str]] = []
     for fault in faults:
         for kind, at in (
@@ -624,7 +635,7 @@ def _marks(
 
 
 def _autopilot_marks(summary: Summary) -> list[dict[str, Any]]:
-    """Mark what the autopilot said; its errors with their words."""
+    """Return marks for the messages of the autopilot. Errors are marked with their text."""
     return [
         {
             "x": one.at_s,
@@ -654,7 +665,7 @@ def _autopilot_section(said: Sequence[AutopilotText]) -> list[Section]:
 
 
 def _marks_hint(summary: Summary) -> str:
-    """Say what the marks and shades are."""
+    """Explain marks and shades."""
     hint = "✕ an episode begins, ◆ its channel is isolated."
     if summary.scores.faults:
         hint = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."

@@ -1,15 +1,15 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Makes episodes of what a monitor gives sample by sample: its states, residuals, statistic and fused rate.
+"""Makes episodes from the output of a monitor: states, residuals, statistic and fused rate of each sample.
 
-An episode begins with a declaration while nothing of it stood, follows the set of channels as it widens, narrows and
-comes to a name, and ends when nothing of it stands any more, or with its stretch. What a channel hides behind
-(silence, a value out of range) does not end it, and what comes back from there declares nothing anew.
+An episode begins with a new declaration. The set of its channels may grow, shrink and become one
+channel. The episode ends when all declarations are withdrawn, or with the stretch. Silence and
+values out of range do not end an episode, and a return from them is no new declaration.
 
-How large an error is follows from the residuals whatever was fused: what is left of the residual of a channel after
-the rate that the residuals of the others give (least squares over the channels that stand undeclared) is its error,
-if the others are well.
+The size of an error follows from the residuals, whatever was fused. The least-squares rate of the
+residuals of all undeclared channels is subtracted from the residual of the channel. The rest is the
+error of the channel, provided that the others are healthy.
 """
 
 from __future__ import annotations
@@ -51,30 +51,34 @@ from fdi_ros.replay.episodes import (
 )
 from fdi_ros.replay.outcomes import SQUARED, finite
 
-Told = NDArray[np.uint8]  # states, of which those that say nothing are OK
+Told = NDArray[np.uint8]
+"""States of channels, where states without a declaration count as OK."""
 S = ChannelState
 _DECLARED, _TOLD, _HIDING = (
     (S.AMBIGUOUS, S.FAULTY),
     (S.AMBIGUOUS, S.FAULTY, S.STALE),
     (S.STALE, S.SUSPECT),
 )
-"""States that declare; that an episode may have; that hide what is declared."""
+"""States with a declaration, states of an episode, and states that hide a declaration."""
 
 MOST_EPISODES = 1000
-MOST_STEPS = 20  # of an episode: the first ones and the last
+MOST_STEPS = 20
+"""Largest number of steps of an episode. The last step is always kept."""
 TOGETHER = 0.5
-"""Channels of a unit that fall silent within this time are one episode; and what is silent for less than `HOLE` so
-soon after a hole in the stream is part of the hole; and what the rate was before, is taken so long before, s."""
-_DIAGONAL = [0, 3, 5]  # of a symmetric matrix, in its upper triangle
-HOLES = (
-    0.1,
-    5.0,
-)  # a hole in the stream is longer than this, s, and than so many of the interval before
+"""Channels of a unit that fall silent within this time, s, belong to one episode. Silence shorter
+than `HOLE` that begins within this time after a hole belongs to the hole. The rate before an
+episode is the one at this time before its start."""
+_DIAGONAL = [0, 3, 5]
+"""Indices of the diagonal in the upper triangle of a symmetric 3 x 3 matrix."""
+LEAST_HOLE = 0.1
+"""Smallest hole in a stream, s."""
+HOLE_INTERVALS = 5.0
+"""Smallest hole in a stream, as a multiple of the interval before."""
 
 
 @dataclass
 class _Open:
-    """An episode that still stands."""
+    """An episode with a standing declaration."""
 
     kind: ChannelState
     members: set[int]
@@ -85,7 +89,7 @@ class _Open:
     after_hole: bool
     steps: list[Step] = field(default_factory=list)
     batches: dict[tuple[int, ...], Batches] = field(default_factory=dict)
-    """Errors of single channels, and by how much the pairs of one axis differ."""
+    """Errors of single channels, and differences of pairs that measure one axis."""
     ratio: float = float("nan")
     alarms: int = 0
     last_alarm: float | None = None
@@ -96,12 +100,12 @@ class _Open:
 
 
 class Recorder:
-    """Tells the story of one monitor on one stream, block after block; memory does not grow with its length."""
+    """Records the episodes of one monitor on one stream, block by block, in bounded memory."""
 
     def __init__(
         self, geometry: Geometry, noise: NoiseModel, quantity: Quantity = RATE
     ) -> None:
-        """``noise``: in units of the natural size of the quantity."""
+        """``noise``: noise model in units of the natural size of the quantity."""
         self._geometry, self._quantity = geometry, quantity
         noise = noise.for_channels(geometry.n)
         norm = np.linalg.norm(geometry.axes, axis=1)
@@ -112,22 +116,24 @@ class Recorder:
                 quantity.natural * noise.bias_std * np.ones(geometry.n),
             ]
         )
-        """(3, n) noise, rad/s; scale factor, of the rate along the axis; bias, rad/s."""
+        """(3, n) standard deviations of noise, rad/s, scale factor, 1, and bias, rad/s."""
         self._pairs = lone_pairs(geometry)
         self._before: Told = np.zeros(geometry.n, dtype=np.uint8)
         self._tail = np.empty((0, 2))
-        """Times, s, and standard deviations of the fused rate, rad/s, of the last samples and of this block."""
-        self._interval = np.inf  # last interval between two samples, s
+        """Times, s, and standard deviations of the fused rate, rad/s, of the latest samples."""
+        self._interval = np.inf
+        """Last interval between two samples, s."""
         self._open: list[_Open] = []
         self._episodes: list[Episode] = []
         self._more = 0
         self._stretches: list[Stretch] = []
         self._part: Stretch | None = None
-        self._resumed = np.nan  # first sample of the stretch or after the last hole in it, s; NaN: none has come.
+        self._resumed = np.nan
+        """Time of the first sample of the stretch, or after its last hole, s. NaN: no sample yet."""
         self._gains: dict[tuple[bytes, int], Array | None] = {}
 
     def begin_stretch(self) -> None:
-        """End the stretch, and all that stood in it."""
+        """End the stretch and its open episodes."""
         self._episodes_ended([*self._open], None)
         self._open, self._before = [], np.zeros_like(self._before)
         self._tail, self._interval, self._resumed = np.empty((0, 2)), np.inf, np.nan
@@ -136,11 +142,11 @@ class Recorder:
         self._part = None
 
     def add(self, time: Array, output: Output) -> None:
-        """Take the next samples; time (N,) s from the first message."""
+        """Add the next samples at times (N,), s from the first message."""
         if not len(output):
             return
         if np.isnan(self._resumed):
-            # Units begin one after the other, as behind a hole.
+            # Units start one after the other, as after a hole.
             self._resumed = float(time[0])
         resumed, told = self._holes(time), self._told(output.state)
         before = np.vstack([self._before, told[:-1]])
@@ -173,10 +179,10 @@ class Recorder:
         self._tail = self._tail[self._row_before(time[-1]) :]
 
     def story(self, end: float = np.inf) -> Story:
-        """Return all that happened so far; what stands, stands to the last sample.
+        """Return the story so far. Open episodes last to the last sample.
 
-        Channels that give nothing from the last sample that all have on, `end` in s, have come to the end of the
-        recording: no episode.
+        ``end``: time of the last sample of all channels, s. Silence that begins later is the end of
+        the recording, and no episode.
         """
         standing = [self._ended(one, None) for one in self._open]
         kept = [
@@ -205,7 +211,7 @@ class Recorder:
         )
 
     def _told(self, state: NDArray[np.uint8]) -> Told:
-        """Return what the states (N, n) say; what hides nothing says nothing."""
+        """Reduce states (N, n) to declarations. A hidden declaration is kept."""
         if not state.any():
             return state
         told, in_sets = state.copy(), (state == S.AMBIGUOUS).any(axis=0)
@@ -216,7 +222,7 @@ class Recorder:
         return told
 
     def _add_to_stretch(self, time: Array, output: Output, before: Told) -> None:
-        """Count samples; before: what was told right before each."""
+        """Count samples. ``before``: reduced states before each sample."""
         part = self._part or Stretch(float(time[0]), float(time[0]), 0, 0, 0.0)
         judged, steps = (
             np.isfinite(output.threshold),
@@ -234,7 +240,7 @@ class Recorder:
     def _change(
         self, at: float, before: Told, now: Told, reasons: Mapping[int, str]
     ) -> None:
-        """Take over what one sample changed; reasons: by channel."""
+        """Apply the changes of one sample. ``reasons``: reason by channel."""
         new = {
             kind: set(np.flatnonzero((now == kind) & (before != kind)).tolist())
             for kind in _TOLD
@@ -244,7 +250,7 @@ class Recorder:
             return next((reasons[i] for i in sorted(members) if i in reasons), "")
 
         std = float(self._tail[self._row_before(at), 1])
-        # A set widens, narrows, or comes to a name.
+        # A set grows, shrinks, or becomes one channel.
         for one in [one for one in self._open if one.kind == S.AMBIGUOUS]:
             named, hiding = (
                 new[S.FAULTY] & one.members,
@@ -272,7 +278,7 @@ class Recorder:
             *(one.members for one in self._open if one.kind != S.STALE)
         )
         for group in self._by_unit(new[S.STALE] - hidden):
-            # Channels that fall silent right after others of their unit are one episode with them.
+            # Channels of one unit that fall silent one after the other are one episode.
             unit = next(
                 (set(unit) for unit in self._geometry.units if group <= set(unit)),
                 group,
@@ -288,20 +294,20 @@ class Recorder:
         self._open = [one for one in self._open if not self._is_over(one, now)]
 
     def _holes(self, time: Array) -> Array:
-        """Find the first samples after holes among those at times (N,), s; return their times."""
+        """Return the times, s, of the first samples after holes, among samples at times (N,), s."""
         before = self._part.end_s if self._part is not None else time[0]
         steps = np.diff(np.concatenate([[before], time]))
         usual = np.concatenate([[self._interval], steps[:-1]])
         if self._part is None:
-            # The first sample of a stretch comes after nothing.
+            # The first sample of a stretch has no interval.
             usual[:2] = np.inf
         self._interval = (
             float(steps[-1]) if len(time) > 1 or self._part is not None else np.inf
         )
-        return time[(steps > HOLES[0]) & (steps > HOLES[1] * usual)]
+        return time[(steps > LEAST_HOLE) & (steps > HOLE_INTERVALS * usual)]
 
     def _row_before(self, at: float) -> int:
-        """Row of the tail shortly before a time, s: before any suspicion took its share; else the first."""
+        """Return the row of the tail shortly before a time, s, or the first row."""
         return max(
             0, int(np.searchsorted(self._tail[:, 0], at - TOGETHER, side="right")) - 1
         )
@@ -316,7 +322,7 @@ class Recorder:
         self._step(self._open[-1], members, at)
 
     def _step(self, one: _Open, members: set[int], at: float) -> None:
-        """Note who it is from now on."""
+        """Add a step with its channels."""
         one.members, one.since = members, at
         channels = sorted(members)
         say = one_of_words if one.kind == S.AMBIGUOUS else all_of_words
@@ -334,7 +340,7 @@ class Recorder:
         }
 
     def _by_unit(self, channels: set[int]) -> list[set[int]]:
-        """Channels that change together: those of one unit are one, others each for itself."""
+        """Group channels by unit. A channel without a unit is a group of its own."""
         groups = [set(unit) & channels for unit in self._geometry.units]
         left = channels - set().union(*groups)
         return [*(group for group in groups if group), *({i} for i in sorted(left))]
@@ -345,7 +351,7 @@ class Recorder:
         return all(now[i] != one.kind for i in one.members)
 
     def _take(self, rows: slice, time: Array, output: Output, told: Told) -> None:
-        """Add samples, of which all have the same states, to what stands."""
+        """Add samples with equal states to the open episodes."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = output.statistic[rows] / output.threshold[rows]
         ratio = ratio[np.isfinite(ratio)]
@@ -369,7 +375,7 @@ class Recorder:
     def _measure(
         self, one: _Open, rows: slice, time: Array, output: Output, told: Told
     ) -> None:
-        """Add the errors that the channels of an episode have by the others."""
+        """Add the errors of the channels of an episode, measured by the other channels."""
         axes, residual = self._geometry.axes, output.residual[rows]
 
         def add(key: tuple[int, ...], gain: Array, error: Array) -> None:
@@ -392,7 +398,7 @@ class Recorder:
                 add((a, b), both, residual[:, a] - scale * residual[:, b])
 
     def _apart(self, one: _Open) -> Apart | None:
-        """Find the pair of channels of one axis that is surely apart, by most of its standard errors; None: none is."""
+        """Return the pair on one axis whose difference is most significant. None: no pair differs."""
         pairs = {
             key: batches.size(one.since)
             for key, batches in one.batches.items()
@@ -411,7 +417,10 @@ class Recorder:
         return Apart(names, one_of_words(self._geometry, pair), size)
 
     def _gain(self, trusted: NDArray[np.bool_], i: int) -> Array | None:
-        """Row (n,) that makes the error of a channel of all residuals; None: the others do not tell."""
+        """Return the row (n,) that gives the error of a channel from all residuals.
+
+        None: the other channels do not determine the error.
+        """
         key = trusted.tobytes(), i
         if key not in self._gains:
             axes = self._geometry.axes
@@ -436,7 +445,7 @@ class Recorder:
         self._more += len(found[room:])
 
     def _ended(self, one: _Open, at: float | None) -> Episode | None:
-        """Make an episode of what has ended, or stands to the end; None: it was nothing but a hole."""
+        """Make an episode from one that ended or is open. None: only a hole."""
         assert self._part is not None
         end = self._part.end_s if at is None else at
         if one.kind == S.STALE and one.after_hole and end - one.start < HOLE:
@@ -480,34 +489,53 @@ class Recorder:
 
 
 def _stds(output: Output) -> Array:
-    """Root of the trace of the covariance (N,), rad/s; NaN: no rate."""
+    """Return the root of the trace of the covariance, (N,), rad/s. NaN: no rate."""
     with np.errstate(invalid="ignore"):
         stds = np.sqrt(output.rows["covariance"][:, _DIAGONAL].sum(axis=1))
     return np.where(output.valid, stds, np.nan)
 
 
-# The size of an error, and what it did over time: memory does not grow ------------------------------------------------
+# Size and course of an error, in bounded memory
 
 
-MOST = 512  # batches kept; when there would be more, neighbours are put together
-FIRST_WIDTH = 0.1  # of a batch, s
+MOST = 512
+"""Largest number of batches. If exceeded, neighbours are merged."""
+FIRST_WIDTH = 0.1
+"""Width of a batch at first, s."""
 LONGER = 12
-"""Batches that the standard error is taken from, put together of those kept: an error hangs together for less."""
-FEW = 4  # batches from which on their scatter says something
-CERTAIN = 4.0  # a trend is one from so many of its standard errors on
-TREND = 0.3  # and from a change of such a share of the size on
-PASSED = 0.25  # an error has passed when it stays below such a share of what it was
-LASTING = 1.0  # time over which the size at the declaration is taken, and for which an error must have stayed away, s
-ROUNDING = 1e-12  # share of a mean square that is rounding
-SMALL = 0.5  # a mean below such a share of the scatter is not what the error is
-LOUD = 3.0  # an error is noise where it scatters so many times as much as the channel's noise lets it
+"""Number of merged batches for the standard error. An error is correlated for a shorter time."""
+FEW = 4
+"""Smallest number of batches with a meaningful scatter."""
+CERTAIN = 4.0
+"""Standard errors from which on a trend is significant."""
+TREND = 0.3
+"""Smallest change of a trend, as a share of the size."""
+PASSED = 0.25
+"""Share of its former size below which an error is over."""
+LASTING = 1.0
+"""Time over which the size at the declaration is averaged, s. Also the time for which an error must
+stay below `PASSED` to be over."""
+ROUNDING = 1e-12
+"""Share of a mean square that is rounding error."""
+SMALL = 0.5
+"""Ratio of mean to scatter below which the error is not described by its mean."""
+LOUD = 3.0
+"""Ratio of scatter to expected noise from which on an error is noise."""
 
 
 class Batches:
-    """Means of an error over batches of time, from ``begin`` on, s.
+    """Means of an error over batches of time.
 
-    ``noise``: standard deviation that it alone gives the error in one sample, rad/s. ``scale``, ``bias``: standard
-    deviation of what unknown scale factors make of the rate, as a share of it, and of unknown biases, rad/s.
+    Parameters
+    ----------
+    begin
+        Begin of the first batch, s.
+    noise
+        Standard deviation of the error in one sample from noise, rad/s.
+    scale
+        Standard deviation of unknown scale factors, as a share of the rate.
+    bias
+        Standard deviation of unknown biases, rad/s.
     """
 
     def __init__(
@@ -515,14 +543,14 @@ class Batches:
     ) -> None:
         self._begin, self._noise, self._scale, self._bias = begin, noise, scale, bias
         self._width = FIRST_WIDTH
-        # Of each batch: samples, sum, sum of squares.
+        # Number of samples, sum, sum of squares of each batch.
         self._sums = np.zeros((3, MOST))
         self._with_rate = np.zeros(
             2
         )  # sum of error times rate, and of the squared rate
 
     def add(self, time: Array, error: Array, rate: Array) -> None:
-        """Take in samples (N,): time, s; error and rate along the axis, rad/s; what is not finite does not count."""
+        """Add finite samples (N,): time, s, error and rate along the axis, rad/s."""
         known = np.isfinite(error) & (np.abs(error) < SQUARED)
         time, error, rate = time[known], error[known], np.nan_to_num(rate[known])
         if not len(time):
@@ -539,7 +567,7 @@ class Batches:
         self._with_rate += float(error @ rate), float(rate @ rate)
 
     def size(self, declared: float) -> Size | None:
-        """Sum up; declared: time of the declaration, s. None: no sample was known."""
+        """Return size and course. ``declared``: time of the declaration, s. None: no sample."""
         count, total, square = self._sums
         used = np.flatnonzero(count)
         if not len(used):
@@ -558,7 +586,7 @@ class Batches:
         std = math.hypot(_standard_error(mean, scatter, samples), lasting)
         last = float(mean[-1])
         rms, (product, rates) = math.sqrt(mean_square), self._with_rate.tolist()
-        # The share of its mean square that a regression on the rate explains.
+        # Share of the mean square that a regression on the rate explains.
         explained = (
             product**2 / (rates * samples * mean_square)
             if rates > 0.0 and mean_square > 0.0
@@ -595,7 +623,7 @@ class Batches:
         return Size(whole, std, "steady", last)
 
     def _gone(self, used: NDArray[np.intp], mean: Array, then: float) -> float | None:
-        """Since when the means have stayed well below what they were at the declaration, s; None: they have not."""
+        """Return the time, s, since which the error is below `PASSED`. None: the error is not over."""
         large = np.flatnonzero(np.abs(mean) >= PASSED * abs(then))
         if not len(large) or large[-1] == len(mean) - 1:
             return None
@@ -605,7 +633,10 @@ class Batches:
 
 
 def _standard_error(means: Array, scatter: float, samples: float) -> float:
-    """Of the mean of all, from the scatter of the batch means and that of single samples, whichever says more."""
+    """Return the standard error of the mean, from the scatter of batch means or of samples.
+
+    The larger of the two counts.
+    """
     by_sample = scatter / max(samples, 1.0)
     if len(means) >= 2 * LONGER:
         means = np.array([part.mean() for part in np.array_split(means, LONGER)])
@@ -614,7 +645,7 @@ def _standard_error(means: Array, scatter: float, samples: float) -> float:
 
 
 def _trend(time: Array, mean: Array) -> float | None:
-    """Slope of a straight line through the means (k,), where it is certain; else None."""
+    """Return the slope of a straight line through the means (k,). None: not significant."""
     if len(mean) < 2 * FEW:
         return None
     x = time - time.mean()

@@ -1,18 +1,18 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A stream through the monitor: what it would have declared, and when.
+"""Passes a recorded or simulated stream through a monitor.
 
-    recording, or samples at hand -> stretches -> faults -> monitor -> evaluation, episodes, sinks
+    recording or samples -> stretches -> faults -> monitor -> evaluation, episodes, sinks
 
-`Walk` is the only place where what was recorded or simulated passes a monitor; `Judge` is a walk that says what came of
-it; `replay` judges a recording, `read` only reads it. The stream passes block by block; memory does not grow with it.
+`Walk` passes a stream through one monitor, block by block, in bounded memory. `Judge` is a walk with
+a result. `replay` judges a recording, and `read` only reads a recording.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.bag.raw import Batch
+from fdi_ros.bag.raw import Batch, LogText
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.compiling.notice import clock
@@ -54,76 +54,79 @@ from fdi_ros.replay.summary import (
 )
 from fdi_ros.replay.verdict import LASTING, verdict_of
 
-OnProgress = Callable[[float], None]  # called with the share done, 0 to 1
+OnProgress = Callable[[float], None]
+"""Called with the share done, 0 to 1."""
 Source = str | PathLike[str]
 ConfigSource = Config | Source | None
-"""Settings, or a parameter file; None: what ``fdi inspect`` writes for the recording."""
-PORTION = 16384  # samples judged at once where many are at hand: their outputs take little memory
+"""Settings, or a parameter file. None: the settings that ``fdi inspect`` writes."""
+PORTION = 16384
+"""Largest number of samples that are judged at once, which bounds the memory for their outputs."""
 LAST_SAMPLES = 1_000_000_000
-"""A channel whose values end no sooner than this before the recording delivers to its end, ns."""
+"""A channel delivers to the end if its last value is this close to the last sample, ns."""
 
 
 class Sink:
-    """Takes the outputs of a pipeline as they come."""
+    """Receives the outputs of a pipeline, block by block."""
 
     stops_at_events: ClassVar[bool] = False
-    """Each output is to end at the sample that brings events, so that the pipeline stands right after them."""
-    period: ClassVar[int] = (
-        0  # it looks at recording and pipeline at multiples of this time of recording, ns; 0: never
-    )
+    """Whether each output ends at a sample with events, so that the pipeline has the state after them."""
+    period: ClassVar[int] = 0
+    """Period of `tick` in the time of recording, ns. 0: never."""
 
     def tap(self, batch: Batch, rows: Int) -> None:
-        """Take raw messages as they are read: those rows of a batch that are used."""
+        """Receive raw messages: the rows of a batch that are used."""
 
     def begin(self, samples: Samples) -> None:
-        """Look at the recording before its next samples come."""
+        """Prepare for the next samples of a recording."""
 
     def begin_stretch(self) -> None:
-        """Note that the next samples come after a long gap, and that nothing stands declared any more."""
+        """Begin a stretch after a long gap, with all declarations cleared."""
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
-        """Take the next samples, with the pipeline as it is right after them."""
+        """Receive the next samples, with the pipeline in its state after them."""
 
     def tick(self, samples: Samples, pipeline: Pipeline) -> None:
-        """Look at recording and pipeline: once per period of the recording, where a sink has one."""
+        """Look at recording and pipeline, once per `period`."""
 
 
 class Kept(Sink):
-    """Keeps, for all samples, what a function makes of each output: arrays of as many rows."""
+    """Keeps columns of all outputs, which a function derives from each output."""
 
     def __init__(self, columns_of: Callable[[Output], Sequence[NDArray[Any]]]) -> None:
         self._columns_of = columns_of
         self._parts: list[Sequence[NDArray[Any]]] = []
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
-        """Keep what is made of the next samples."""
+        """Keep the columns of the next samples."""
         self._parts.append(self._columns_of(output))
 
     @property
     def columns(self) -> list[NDArray[Any]]:
-        """The arrays, over all samples."""
+        """The columns over all samples."""
         return [np.concatenate(column) for column in zip(*self._parts, strict=True)]
 
 
 class Walk:
-    """One monitor, taken as it is, on one stream, cut into stretches at gaps; with each it forgets what is declared.
+    """Passes one stream through one monitor, and clears all declarations at long gaps.
 
-    Biases stay: they are the same sensors'.
+    Biases are kept, because the sensors are the same.
     """
 
     def __init__(self, pipeline: Pipeline, sinks: Sequence[Sink] = ()) -> None:
         self.pipeline, self.sinks = pipeline, sinks
-        self.seconds = 0.0  # spent in the pipeline
-        self._last: int | None = None  # stamp of the last sample, ns
+        self.seconds = 0.0
+        """Time spent in the pipeline, s."""
+        self._last: int | None = None
+        """Stamp of the last sample, ns."""
 
     def take(self, block: Block) -> None:
-        """Take the next samples, of any number."""
+        """Take any number of samples."""
         for first in range(0, len(block), PORTION):
             for piece in self.pieces(block[first : first + PORTION]):
                 self.feed(piece)
 
     def pieces(self, block: Block) -> Iterator[Block]:
-        """Cut the next block at gaps; each piece is to be fed before the next."""
+        """Cut a block at gaps. The caller feeds each piece before the next one."""
         if not len(block):
             yield block
         for rows in pieces(block.stamp, GAP):
@@ -134,13 +137,13 @@ class Walk:
             yield block[rows]
 
     def begin_stretch(self, first: int) -> None:
-        """Forget what is declared and suspected; first: stamp of the next sample, ns."""
+        """Clear declarations and suspicions. ``first``: stamp of the next sample, ns."""
         self.pipeline.reset()
         for sink in self.sinks:
             sink.begin_stretch()
 
     def feed(self, block: Block) -> None:
-        """Pass a piece without a gap through the monitor."""
+        """Pass a piece without a long gap through the monitor."""
         stepwise = any(sink.stops_at_events for sink in self.sinks)
         row, begun = 0, clock()
         for output in (
@@ -153,13 +156,16 @@ class Walk:
             begun = clock()
 
     def add(self, block: Block, output: Output, rows: slice) -> None:
-        """Hand on what came of some rows of the piece."""
+        """Pass the output for some rows of a piece to the sinks."""
         for sink in self.sinks:
             sink.add(block, output, self.pipeline)
 
 
 class Judge(Walk):
-    """A walk that says what came of it; where faults are injected, beside a monitor on the stream without faults."""
+    """A walk with a result.
+
+    With injected faults, a second monitor works on the stream without faults, for comparison.
+    """
 
     def __init__(
         self, pipeline: Pipeline, injector: Injector, sinks: Sequence[Sink] = ()
@@ -169,26 +175,25 @@ class Judge(Walk):
         self.evaluation = Evaluation(
             injector, pipeline.geometry, pipeline.channel_names
         )
-        self._intervals: list[
-            tuple[float, int]
-        ] = []  # of each piece: the usual one, ns, and how many samples have it
+        self._intervals: list[tuple[float, int]] = []
+        """Median interval, ns, and number of samples of each piece."""
         self._recorders = [
             Recorder(half.geometry, half.noise, half.quantity)
             for half in pipeline.halves
         ]
         self._degraded: dict[str, str] = {}
-        """What is worse than it should be without being declared: the last message on each channel and unit."""
+        """Last message on each degraded channel or unit, by name."""
         self._reference = pipeline.twin() if injector.faults else None
         self._values = [
             Values(half.geometry.n, half.quantity) for half in pipeline.halves
         ]
         self._delivered = np.zeros(pipeline.geometry.n, dtype=np.int64)
-        """Stamp of the last value of each channel as it was recorded, ns."""
+        """Stamp of the last recorded value of each channel, ns."""
         self._clean: Array | None = None
-        """(N, 3) rate of the piece without the faults, rad/s; NaN: a gyro is at the end of its range."""
+        """(N, 3) rate of the piece without the faults, rad/s. NaN: a gyro is saturated."""
 
     def begin_stretch(self, first: int) -> None:
-        """Forget what is declared and suspected; what happened in the stretch before is over."""
+        """Clear declarations and suspicions, and end the episodes of the stretch before."""
         before, after = self.injector.time(
             np.array([self.evaluation.last, first])
         ).tolist()
@@ -201,7 +206,7 @@ class Judge(Walk):
             recorder.begin_stretch()
 
     def feed(self, block: Block) -> None:
-        """Pass a piece without a gap through the monitor, with the faults in it."""
+        """Pass a piece without a long gap through the monitor, with the faults injected."""
         block = self.pipeline.arranged(block)
         if len(block) > 1:
             self._intervals.append((float(np.median(np.diff(block.stamp))), len(block)))
@@ -211,7 +216,7 @@ class Judge(Walk):
         for values, half in zip(self._values, faulty.halves, strict=True):
             values.add(half)
         if self._reference is not None:
-            # A gyro at the end of its range is wrong in both streams: what differs then is no effect of the fault.
+            # A saturated gyro is wrong in both streams, so that their difference means nothing.
             limit = np.array(self.pipeline.config.health.max_rate)
             saturated = (np.abs(block.z) >= limit).any(axis=1, keepdims=True)
             self._clean = np.where(
@@ -224,7 +229,7 @@ class Judge(Walk):
         self._degraded |= degraded(self.pipeline.status())
 
     def add(self, block: Block, output: Output, rows: slice) -> None:
-        """Take in what came of some rows of the piece."""
+        """Evaluate and record the output for some rows of a piece."""
         self.evaluation.add(output, None if self._clean is None else self._clean[rows])
         time = np.round(self.injector.time(output.stamp), 9)
         for recorder, half in zip(self._recorders, output.halves, strict=True):
@@ -232,7 +237,7 @@ class Judge(Walk):
         super().add(block, output, rows)
 
     def judgement(self) -> Judgement:
-        """Return what the monitor made of the stream so far."""
+        """Return the result so far."""
         status, evaluation, end = self.pipeline.status(), self.evaluation, self._end
         delays = zip(status.units, status.delays, status.delay_std, strict=False)
         levels = (status.protection_level, status.protection_level_after_loss)
@@ -281,7 +286,7 @@ class Judge(Walk):
         )
 
     def _noisy(self, statuses: Sequence[ChannelStatus]) -> dict[str, str]:
-        """Say for how long channels were noisy, seconds at least, by their name."""
+        """Describe channels that were noisy for a second or more, by name."""
         seconds = {
             one.name: one.counts["noisy"] / (self.rate or math.inf) for one in statuses
         }
@@ -295,7 +300,7 @@ class Judge(Walk):
     def _channels(
         self, end: float, statuses: Sequence[ChannelStatus]
     ) -> Iterator[ChannelResult]:
-        """Yield each channel as it was at a time near the end, s."""
+        """Yield the result of each channel. ``end``: time of its state, s."""
         evaluation = self.evaluation
         samples = max(1, self._values[0].samples)
         finite_values, saturated = (
@@ -338,7 +343,7 @@ class Judge(Walk):
             )
 
     def _units(self, status: Status) -> Iterator[UnitHealth]:
-        """Yield the units, or the one topic with all channels."""
+        """Yield the health of each unit, or of the one topic with all channels."""
         source = source_of(self.pipeline.config)
         late = {
             unit.name: (delay, std)
@@ -346,7 +351,7 @@ class Judge(Walk):
                 status.units, status.delays, status.delay_std, strict=False
             )
         }
-        # Copies are named with their topics: "imu_2 (/imu_2/data)".
+        # The status names copies with their topics: "imu_2 (/imu_2/data)".
         copies = {second: first for first, second in status.copies}
         for name, topic in zip(source.names, source.topics, strict=True):
             delay, std = late.get(name, (None, None))
@@ -360,9 +365,9 @@ class Judge(Walk):
 
     @property
     def _end(self) -> float:
-        """Time of the last sample that all channels have which deliver to the end, s from the first message.
+        """Time of the last sample of all channels that deliver to the end, s from the first message.
 
-        Delays that are taken off, and the end of a log, leave units without the last samples.
+        A corrected delay or the end of a log leaves some units without the last samples.
         """
         last = self.evaluation.last
         delivered = self._delivered[self._delivered >= last - LAST_SAMPLES]
@@ -370,7 +375,7 @@ class Judge(Walk):
 
     @property
     def rate(self) -> float | None:
-        """Usual number of samples per second; None: too few samples to say."""
+        """Median number of samples per second, Hz. None: too few samples."""
         if not self._intervals:
             return None
         step, count = np.array(sorted(self._intervals)).T
@@ -378,7 +383,7 @@ class Judge(Walk):
 
 
 def _joined(stories: Sequence[Story]) -> Story:
-    """Put together the stories of gyros and accelerometers, with the stretches of the former."""
+    """Merge the stories of gyros and accelerometers, with the stretches of the gyros."""
     episodes = [one for story in stories for one in story.episodes]
     episodes.sort(key=lambda one: (one.start_s, one.since_s))
     return Story(
@@ -387,7 +392,7 @@ def _joined(stories: Sequence[Story]) -> Story:
 
 
 def _doubt_words(state: str, since: float | None, reason: str, end: float) -> str:
-    """Return what is wrong with a channel that is not declared, in words; empty: nothing."""
+    """Return why an undeclared channel is not used at the end. Empty: it is used."""
     if state == "EXCLUDED":
         return f"remained left out: {reason}"
     if state != "SUSPECT" or since is None or end - since < LASTING:
@@ -408,14 +413,18 @@ def read(
     path
         rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file.
     config
-        Settings, or a ROS 2 parameter file; None: what ``fdi inspect`` writes for this recording.
+        Settings, or a ROS 2 parameter file. None: the settings that ``fdi inspect`` writes.
     start, end
-        Part to be read, s from the first message.
+        Part to read, s from the first message.
 
     Returns
     -------
-    Blocks of consecutive samples: stamps (N,) ns, values (N, n) rad/s, as `Pipeline.process` takes them. `FdiError` if
-    there is no such recording, or it lacks a topic of the settings.
+    Blocks of consecutive samples for `Pipeline.process`: ``stamp`` (N,), ns, and ``z`` (N, n), rad/s.
+
+    Raises
+    ------
+    FdiError
+        If the recording cannot be read, or lacks a topic of the settings.
     """
     bag = Path(path)
     if config is None:
@@ -424,7 +433,7 @@ def read(
         )
     else:
         settings = Config.of(config)
-    # Refused now, not with the first block.
+    # Raise errors now, not with the first block.
     recording = Recording(bag)
     samples = Samples(recording, settings, start, end)
 
@@ -453,114 +462,134 @@ def replay(
     Parameters
     ----------
     path, start, end
-        As of `read`.
+        As for `read`.
     config
-        Settings, or a ROS 2 parameter file; None: what ``fdi inspect`` writes for this recording, if its units are
-        mounted alike.
+        Settings, or a ROS 2 parameter file. None: the settings that ``fdi inspect`` writes, if all
+        units are mounted alike.
     faults
-        One or several to be injected, each in words or as a mapping:
+        One fault or several, each as text or as a mapping:
         ``"channel=imu_2.y kind=bias size=0.2 start=30"`` or
         ``{"channel": "imu_2.y", "kind": "bias", "size": 0.2, "start": 30}``.
     sinks
-        Take the outputs of the monitor as they come.
+        Receive the outputs of the monitor.
     progress
         Called with the share done, 0 to 1.
 
     Returns
     -------
-    What was declared, what became of the faults, and the state of the monitor at the end. `FdiError` if recording,
-    settings or faults do not fit, or there are no settings and none can be assumed.
+    Verdict, declarations, results for the faults, and the state of the monitor at the end.
+
+    Raises
+    ------
+    FdiError
+        If recording, settings or faults do not fit, or no settings are given and none can be
+        assumed.
     """
-    bag = Path(path)
+    bag, begun = Path(path), clock()
     unused: tuple[tuple[str, str], ...] = ()
     if config is None:
         assumed = assumed_config(bag)
         settings, unused = assumed.config, assumed.unused
     else:
         settings = Config.of(config)
-    begun, period = clock(), max((sink.period for sink in sinks), default=0)
-    given = _faults(faults)
-    judge: Judge | None = None
     deliveries = Deliveries(len(settings.topics), start)
     taps = [*(sink.tap for sink in sinks), deliveries.tap]
+    period = max((sink.period for sink in sinks), default=0)
     with Recording(bag) as recording:
         samples = Samples(recording, settings, start, end, taps, period)
-        for block in samples.blocks():
-            if judge is None:
-                judge = _judge_of(settings, samples, given, sinks)
-            injector = judge.injector
-            injector.start_stamp = samples.origin
-            if len(block) and not judge.evaluation.samples:
-                first, learned = (
-                    float(injector.time(block.stamp[0])),
-                    settings.bias.startup_bias_duration,
-                )
-                why = (
-                    "the start-up biases are measured until then"
-                    if learned > 0
-                    else "the part that is read begins there"
-                )
-                injector.refuse_between(
-                    -math.inf, first + learned if learned > 0 else start, why
-                )
-            for piece in judge.pieces(block):
-                for sink in sinks:
-                    sink.begin(samples)
-                judge.feed(piece)
-                for sink in sinks if period else ():
-                    sink.tick(samples, judge.pipeline)
-            if progress is not None:
-                progress(samples.progress)
-        assert judge is not None  # no message: that was refused
-        if judge.evaluation.samples:
-            injector.refuse_between(
-                judge.evaluation.time(judge.evaluation.last),
-                math.inf,
-                "that is the last sample",
-            )
-        stream = StreamResult(
-            sample_rate=SampleRate(settings.sample_rate, judge.rate),
-            origin_ns=samples.origin,
-            messages=samples.messages,
-            malformed=samples.malformed,
-            disordered=samples.disordered,
-            alignment=dict(
-                zip(samples.topics, samples.alignment.counters, strict=True)
-            ),
-            damage=recording.damage.report(),
-        )
-        texts = [
-            AutopilotText(judge.evaluation.time(one.stamp), one.kind, one.text)
-            for one in recording.texts
-        ]
+        judge = _judged(samples, settings, _faults(faults), start, sinks, progress)
+        stream = _stream_result(samples, settings, judge)
+        texts = recording.texts
     judgement = judge.judgement()
-    scores, monitor = judgement.scores, judgement.monitor
-    said = tuple(
-        replace(one, at_s=round(one.at_s, 6))
-        for one in texts
-        if scores.start_s <= one.at_s <= scores.end_s
-    )
     units = [
         with_delivery(unit, delivery)
-        for unit, delivery in zip(monitor.units, deliveries.result(), strict=True)
+        for unit, delivery in zip(
+            judgement.monitor.units, deliveries.result(), strict=True
+        )
     ]
     summary = Summary(
         detector=judgement.detector,
-        scores=scores,
-        monitor=replace(monitor, units=tuple(units)),
+        scores=judgement.scores,
+        monitor=replace(judgement.monitor, units=tuple(units)),
         story=judgement.story,
         bag=str(bag),
         stream=stream,
         seconds=clock() - begun,
-        autopilot=said,
+        autopilot=tuple(_autopilot_texts(texts, judge)),
     )
     return with_unused(summary, unused)
+
+
+def _judged(
+    samples: Samples,
+    settings: Config,
+    faults: Sequence[Fault],
+    start: float,
+    sinks: Sequence[Sink],
+    progress: OnProgress | None,
+) -> Judge:
+    """Pass a recording through a monitor. ``start``: begin of the part that is read, s."""
+    judge: Judge | None = None
+    for block in samples.blocks():
+        if judge is None:
+            judge = _judge_of(settings, samples, faults, sinks)
+        judge.injector.start_stamp = samples.origin
+        if len(block) and not judge.evaluation.samples:
+            _refuse_early_faults(judge, block, start)
+        for piece in judge.pieces(block):
+            for sink in sinks:
+                sink.begin(samples)
+            judge.feed(piece)
+            for sink in sinks if samples.period else ():
+                sink.tick(samples, judge.pipeline)
+        if progress is not None:
+            progress(samples.progress)
+    assert judge is not None  # `Samples.blocks` refuses a recording without messages
+    if judge.evaluation.samples:
+        last = judge.evaluation.time(judge.evaluation.last)
+        judge.injector.refuse_between(last, math.inf, "that is the last sample")
+    return judge
+
+
+def _refuse_early_faults(judge: Judge, first: Block, start: float) -> None:
+    """Refuse faults before the part that is read, or before the start-up biases are known."""
+    learned = judge.pipeline.config.bias.startup_bias_duration
+    if learned <= 0:
+        why = "the part that is read begins there"
+        judge.injector.refuse_between(-math.inf, start, why)
+        return
+    known = float(judge.injector.time(first.stamp[0])) + learned
+    why = "the start-up biases are measured until then"
+    judge.injector.refuse_between(-math.inf, known, why)
+
+
+def _stream_result(samples: Samples, settings: Config, judge: Judge) -> StreamResult:
+    """Return the counters of a recording that was read."""
+    counters = samples.alignment.counters
+    return StreamResult(
+        sample_rate=SampleRate(settings.sample_rate, judge.rate),
+        origin_ns=samples.origin,
+        messages=samples.messages,
+        malformed=samples.malformed,
+        disordered=samples.disordered,
+        alignment=dict(zip(samples.topics, counters, strict=True)),
+        damage=samples.recording.damage.report(),
+    )
+
+
+def _autopilot_texts(texts: Iterable[LogText], judge: Judge) -> Iterator[AutopilotText]:
+    """Yield the messages of the autopilot between the first sample and the last."""
+    scores = judge.evaluation.scores()
+    for one in texts:
+        at = judge.evaluation.time(one.stamp)
+        if scores.start_s <= at <= scores.end_s:
+            yield AutopilotText(round(at, 6), one.kind, one.text)
 
 
 def _judge_of(
     config: Config, samples: Samples, faults: Sequence[Fault], sinks: Sequence[Sink]
 ) -> Judge:
-    """Build what judges a recording of which a block was read: its messages show which units have accelerometers."""
+    """Build a judge. The first messages show which units have accelerometers."""
     pipeline = Pipeline(config)
     if pipeline.undecided:
         pipeline.sense(samples.felt)
@@ -568,14 +597,14 @@ def _judge_of(
 
 
 def with_unused(summary: Summary, unused: Sequence[tuple[str, str]]) -> Summary:
-    """Return a summary, and its verdict, with topics of gyros that were left out, and why."""
+    """Return a summary whose verdict includes gyro topics that were left out, with reasons."""
     stream = replace(summary.stream, unused=tuple(unused))
     summary = replace(summary, stream=stream)
     return replace(summary, verdict=verdict_of(summary))
 
 
 def _faults(given: OneFault | Sequence[OneFault]) -> tuple[Fault, ...]:
-    """Return one fault or several."""
+    """Return the faults, of one or several."""
     if isinstance(given, (Fault, str, Mapping)):
         return (_fault(given),)
     return tuple(map(_fault, given))

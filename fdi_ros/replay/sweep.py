@@ -1,11 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults of several kinds and sizes on every channel of a recording, one at a time, with one monitor or several.
+"""Injects faults of several kinds and sizes into every channel of a recording, one at a time.
 
-The recording is replayed once as it is. Each fault then goes on from the monitor as it stood when the fault begins, so
-that hundreds of faults take seconds and none meets the traces of another: what follows is the same to the last bit as
-if the monitor had seen all samples before.
+The recording is replayed once without faults. Each fault continues from the state of the monitor at
+its onset. So hundreds of faults take seconds, they do not affect each other, and the result equals a
+full replay bit by bit.
 """
 
 from __future__ import annotations
@@ -42,32 +42,33 @@ DEFAULT_FAULTS = (
     "kind=stuck",
     "kind=dropout",
 )
-"""What is swept unless asked otherwise; sizes in rad/s, rad/s^2, and as a share of the rate."""
+"""Default faults. Sizes are in rad/s, in rad/s^2, or a share of the rate."""
 
 
 @dataclass(frozen=True)
 class Swept:
-    """One kind of fault in one size."""
+    """One kind of fault with one size."""
 
     kind: str
-    items: tuple[tuple[str, str], ...]  # its numbers by name, as given
+    items: tuple[tuple[str, str], ...]
+    """Its numbers by name, as the user wrote them."""
 
     @property
     def size(self) -> float | None:
-        """Its size; None: the kind has none."""
+        """Size of the fault. None: the kind has no size."""
         return next(
             (float(value) for name, value in self.items if name == "size"), None
         )
 
     @property
     def unit(self) -> str:
-        """Of its size."""
+        """Unit of the size."""
         option = FAULT_KINDS[self.kind].options().get("size")
         return option.unit if option else ""
 
     @property
     def family(self) -> str:
-        """What it shares with the same fault in other sizes."""
+        """Name that the fault shares with other sizes."""
         return " ".join(
             [
                 self.kind,
@@ -77,12 +78,12 @@ class Swept:
 
     @property
     def words(self) -> str:
-        """As a title: kind, size and unit, other numbers."""
+        """Title: kind, size with unit, other numbers."""
         size = "" if self.size is None else f" {self.size:g} {self.unit}".rstrip()
         return f"{self.kind}{size}{self.family.removeprefix(self.kind)}"
 
     def fault(self, channel: str, start: float, sign: float, seed: int) -> Fault:
-        """Return the fault on a channel from a time on, s; the size of a kind that may have either sign gets it."""
+        """Return the fault on a channel from a time on, s, with a sign if the kind allows one."""
         items: dict[str, object] = {
             "channel": channel,
             "kind": self.kind,
@@ -96,9 +97,9 @@ class Swept:
 
 
 def parse_swept(text: str) -> tuple[Swept, ...]:
-    """Read what is to be swept: ``kind=bias size=0.05,0.1,0.3``, one entry per size.
+    """Read the faults of a sweep: ``kind=bias size=0.05,0.1,0.3`` gives one entry per size.
 
-    `FaultError` if it is not of that form, or a number does not fit its kind.
+    `FaultError` if the form is wrong, or a number does not fit its kind.
     """
     items = key_values(text)
     if chosen := [
@@ -130,38 +131,45 @@ def parse_swept(text: str) -> tuple[Swept, ...]:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is injected, when, and how long it is watched."""
+    """Faults, start times and detection time of a sweep."""
 
     faults: tuple[Swept, ...]
-    times: int = 10  # spread over the recording, for every channel
-    within: float = 5.0  # a fault is watched, and is to be found, for this long, s
-    seed: int = 1  # of signs and of the random kinds
+    times: int = 10
+    """Number of start times per channel, spread over the recording."""
+    within: float = 5.0
+    """Time in which a fault must be found, s."""
+    seed: int = 1
+    """Seed of the signs and of random faults."""
 
 
-# The recording as it is -----------------------------------------------------------------------------------------------
+# The recording without faults
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """What the monitor says of a recording as it is, nothing injected."""
+    """Result for a recording without injected faults."""
 
     judgement: Judgement
-    judged: float  # share of the samples
+    judged: float
+    """Share of judged samples."""
     doubtful: (
         Mask  # (N,) a channel stands declared, by itself or in a set, or gives nothing
     )
-    speed: Array  # (N,) fused rate, rad/s; NaN: none.
-    begins: float  # when it first judges, s; NaN: never.
-    duration: float  # from the first sample to the last, s
+    speed: Array
+    """(N,) norm of the fused rate, rad/s. NaN: no rate."""
+    begins: float
+    """Time of the first judged sample, s. NaN: never."""
+    duration: float
+    """Time from the first sample to the last, s."""
 
     @property
     def declared(self) -> list[StateChange]:
-        """Declarations."""
+        """Declarations, in the order of time."""
         return [event for event in self.judgement.scores.events if event.declares]
 
     @property
     def note(self) -> str:
-        """Why nothing was judged, or why checking is limited at the end; empty if neither."""
+        """Why no sample was judged, or why checking is limited at the end. Empty: neither."""
         monitor, samples = self.judgement.monitor, self.judgement.scores.samples
         if monitor.note or self.judged:
             return monitor.note
@@ -174,7 +182,7 @@ class Baseline:
 
 
 def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
-    """Judge a recording as it is; `BagError` if there is not a single sample."""
+    """Judge a recording without faults. `BagError` if it has no sample."""
     if not len(block):
         raise BagError(
             "its topics have no time in common: there is no sample of all channels"
@@ -207,37 +215,43 @@ def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
 
 
 def _seconds(block: Block) -> Array:
-    """Return the times (N,) of the samples, s from the first."""
+    """Return the times (N,) of the samples, s from the first sample."""
     return np.asarray((block.stamp - block.stamp[0]) * 1e-9)
 
 
 def _rows_at(block: Block, at: float, watch: float) -> slice:
-    """Find the samples from a time on, s from the first, for so long."""
+    """Return the samples from a time on, s from the first sample, for ``watch`` s."""
     return slice(*np.searchsorted(_seconds(block), (at, at + watch)).tolist())
 
 
-# One fault, from the monitor as it stood before -----------------------------------------------------------------------
+# One fault, from the state of the monitor at its onset
 
 
-LEAD = 1000  # samples before a fault that kinds with a memory may look back on
+LEAD = 1000
+"""Samples before a fault that kinds with a memory can use."""
 
 
 @dataclass(frozen=True)
 class Onset:
-    """A time from which faults are injected, and all that the monitor remembers right before."""
+    """A start time of faults, with the memory of the monitor before it."""
 
-    at: float  # s from the first sample
-    origin: int  # stamp of the first sample, ns
-    core: NDArray[Any]  # (1,) `fdi_ros.core.records.Core`
+    at: float
+    """Start time, s from the first sample."""
+    origin: int
+    """Stamp of the first sample, ns."""
+    core: NDArray[Any]
+    """(1,) `fdi_ros.core.records.Core`."""
     states: list[dict[int, NDArray[Any]]]
-    """Memory of each detector of the monitor for each set of channels, by its bits."""
-    block: Block  # samples from some before the onset to the end of the watch
-    row: int  # first sample of these that is faulty
+    """Memory of each detector by the bits of the set of channels."""
+    block: Block
+    """Samples from shortly before the onset to the end of the detection time."""
+    row: int
+    """Row of the first faulty sample."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One fault, and what came of it."""
+    """One fault with its result."""
 
     channel: int
     swept: Swept
@@ -252,7 +266,7 @@ def onsets_of(
     watch: float,
     lead: int = LEAD,
 ) -> Iterator[Onset]:
-    """Replay a recording as it is up to each of these times, s in increasing order, none of them in a gap."""
+    """Replay a recording without faults up to each time, s. Times increase and lie in no gap."""
     walk, done = Walk(pipeline), 0
     for at in times:
         rows = _rows_at(block, at, watch)
@@ -264,7 +278,7 @@ def onsets_of(
 
 
 def _memory_of(detector: Detector) -> dict[int, NDArray[Any]]:
-    """Memory of a detector for each set of channels that was met, by its bits."""
+    """Return the memory of a detector by the bits of the set of channels."""
     rows = detector.bank["row"][0]
     return {
         int(mask): detector.states[rows[mask]].copy()
@@ -273,12 +287,12 @@ def _memory_of(detector: Detector) -> dict[int, NDArray[Any]]:
 
 
 def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
-    """Go on from an onset with one fault, whatever the monitor, one with the same settings, has seen since.
+    """Continue from an onset with one fault. Return the output from there on.
 
-    Returned is what it says of the samples from there on.
+    The monitor must have the same settings. Its own memory is overwritten.
     """
     for detector, states in zip(pipeline.detectors, onset.states, strict=True):
-        # Sets that were met later are as if they had just been prepared.
+        # Sets that were used later only are reset.
         detector.states[: int(detector.bank["rows"][0])] = np.zeros(
             (), dtype=detector.states.dtype
         )
@@ -293,10 +307,10 @@ def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
 
 
 def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[Trial]:
-    """Inject every fault into one channel at one time, each for itself."""
+    """Inject each fault separately into one channel at one time."""
     pipeline = monitor_of(config)
     name, stamp = pipeline.channel_names[channel], onset.block.stamp[onset.row :]
-    # From the first faulty sample: before it there is nothing to be found.
+    # Times count from the first faulty sample.
     since, start = (
         np.asarray((stamp - stamp[0]) * 1e-9),
         float((stamp[0] - onset.origin) * 1e-9),
@@ -306,7 +320,7 @@ def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[T
         rng = np.random.default_rng(
             [plan.seed, zlib.crc32(f"{name} {swept.family} {onset.at:.6f}".encode())]
         )
-        # One sign and one seed for all sizes: then the sizes alone differ.
+        # All sizes share sign and seed, so that only the size differs.
         fault = swept.fault(
             name, start, float(rng.choice([-1.0, 1.0])), int(rng.integers(2**31))
         )
@@ -324,16 +338,16 @@ def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[T
 
 @lru_cache(maxsize=2)
 def monitor_of(config: Config) -> Pipeline:
-    """Monitor of a config: built once in each process."""
+    """Return the monitor of a config, which is built once in each process."""
     return Pipeline(config.replaced({"accelerometers.enabled": "off"}))
 
 
-# All faults with all monitors -----------------------------------------------------------------------------------------
+# All faults with all monitors
 
 
 @dataclass
 class Subject:
-    """A monitor to be tried, on the samples as it aligns them; `sweep` fills in what came of all faults."""
+    """A monitor with its aligned samples. `sweep` adds the results."""
 
     name: str
     config: Config
@@ -341,11 +355,14 @@ class Subject:
     channels: tuple[
         str, ...
     ] = ()  # names of all channels; those excluded are tried with no fault
-    baseline: Baseline | None = None  # none: the monitor does not run
-    refused: str = ""  # why it does not run, or judges nothing; empty: it does
-    times: tuple[float, ...] = ()  # at which faults began, s
+    baseline: Baseline | None = None
+    """Result without faults. None: the monitor does not run."""
+    refused: str = ""
+    """Why the monitor does not run or judges nothing. Empty: it does."""
+    times: tuple[float, ...] = ()
+    """Start times of the faults, s."""
     skipped: tuple[float, ...] = ()
-    """At which none did, as something stands declared without one, or a channel gives nothing, s."""
+    """Times without faults, because a channel was already declared or silent, s."""
     speeds: tuple[
         float, ...
     ] = ()  # largest fused rate while the faults of each time are watched, rad/s; 0: none
@@ -353,7 +370,7 @@ class Subject:
 
     @property
     def used(self) -> tuple[int, ...]:
-        """Channels that are tried."""
+        """Indices of the channels with injected faults."""
         return tuple(
             i
             for i, name in enumerate(self.channels)
@@ -367,10 +384,10 @@ def sweep(
     workers: int = 1,
     progress: Callable[[float], None] | None = None,
 ) -> Sequence[Subject]:
-    """Try every monitor, all with the same channels, with every fault of the plan, at the same times; return them.
+    """Try every fault of the plan with every monitor, at the same times.
 
-    ``workers``: processes; ``progress`` is called with the share done. `FdiError` if no monitor judges the recording
-    for long enough.
+    All monitors must have the same channels. ``workers``: number of processes. ``progress`` is called
+    with the share done. `FdiError` if no monitor judges the recording for long enough.
     """
     for one in subjects:
         _watch(one)
@@ -416,7 +433,7 @@ def sweep(
 
 
 def _watch(one: Subject) -> None:
-    """Judge the recording as it is, or note why that cannot be done."""
+    """Judge the recording without faults, or store why this is not possible."""
     try:
         one.channels = build_geometry(one.config).channel_names
         pipeline = monitor_of(one.config)
@@ -432,9 +449,9 @@ def _watch(one: Subject) -> None:
 
 
 def _times(baselines: Sequence[Baseline], block: Block, plan: Plan) -> list[float]:
-    """Spread the times of the faults evenly over what all of the monitors judge, s; none of them meets a gap.
+    """Spread start times, s, evenly over the part that all monitors judge, outside of gaps.
 
-    `FaultError` if that is too short to watch a fault.
+    `FaultError` if this part is too short for a fault.
     """
     begins, end = (
         max(one.begins for one in baselines),
@@ -458,7 +475,7 @@ def _times(baselines: Sequence[Baseline], block: Block, plan: Plan) -> list[floa
             f" {plan.within:g} s (within)"
         )
     low, high = np.array(windows).T
-    # As if they stood end to end.
+    # The judged parts count as one continuous time.
     ends = np.cumsum(high - low)
     after = ends[-1] * (np.arange(plan.times) + 0.5) / plan.times
     place = np.searchsorted(ends, after)
@@ -468,7 +485,7 @@ def _times(baselines: Sequence[Baseline], block: Block, plan: Plan) -> list[floa
 def _take_times(
     one: Subject, baseline: Baseline, times: Sequence[float], within: float
 ) -> None:
-    """Take the times at which nothing stands declared, nothing injected, and no sample is missing."""
+    """Keep the times without a declaration and without missing samples."""
     for at in times:
         rows = _rows_at(one.block, at, within)
         doubted = baseline.doubtful[max(0, rows.start - 1) : rows.stop].any()

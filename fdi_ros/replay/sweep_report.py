@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A sweep told: its figures as JSON and CSV, in words and tables for a terminal, and as a page."""
+"""Results of a sweep: JSON, CSV, tables for a terminal, and a page."""
 
 from __future__ import annotations
 
@@ -28,12 +28,14 @@ from fdi_ros.report.layout import (
     section_text,
 )
 
-WANTED = 0.95  # share of the faults of a size that is to be found for the size to count as found
-NOT_ORDERED = ("saturation",)  # kinds of which a larger size is no larger fault
+WANTED = 0.95
+"""Share of the faults of a size that must be found for the size to count as found."""
+NOT_ORDERED = ("saturation",)
+"""Kinds whose faults do not grow with their size."""
 
 
 class Delays(NamedTuple):
-    """Quantiles of a delay over all trials, s; inf: fewer had it."""
+    """Quantiles of a delay over all trials, s. Infinite: fewer trials have a delay."""
 
     median: float
     p95: float
@@ -41,33 +43,36 @@ class Delays(NamedTuple):
 
 @dataclass(frozen=True)
 class Line:
-    """What came of one kind in one size, over channels and times."""
+    """Results for one kind and size, over channels and times."""
 
     swept: Swept
     trials: int
-    counts: dict[str, int]  # trials by outcome
-    named_after: Delays  # until the channel was declared by itself
-    found_after: Delays  # until it was, or was one of a set
+    counts: dict[str, int]
+    """Number of trials by outcome."""
+    named_after: Delays
+    """Delay to the isolation."""
+    found_after: Delays
+    """Delay to the detection."""
 
     def count(self, named: bool) -> int:
-        """Trials in which the channel was named; otherwise also those in which it was in a set."""
+        """Return the number of isolations, or of detections if not ``named``."""
         return self.counts[OutcomeKind.ISOLATED] + (
             0 if named else self.counts[OutcomeKind.AMBIGUOUS]
         )
 
     @property
     def isolated(self) -> Estimate:
-        """Share of the trials in which the channel was named."""
+        """Share of the trials with an isolation."""
         return share(self.count(named=True), self.trials)
 
     @property
     def detected(self) -> Estimate:
-        """Share in which it was named, or in a set."""
+        """Share of the trials with a detection."""
         return share(self.count(named=False), self.trials)
 
     @property
     def false(self) -> int:
-        """Trials in which a channel without a fault was declared, or a set without the faulty one."""
+        """Number of trials with a wrong declaration."""
         return (
             self.counts[OutcomeKind.FALSE_ISOLATION]
             + self.counts[OutcomeKind.FALSE_GROUP]
@@ -75,7 +80,7 @@ class Line:
 
 
 def lines_of(tried: Subject, plan: Plan, channel: int | None = None) -> list[Line]:
-    """Sum up by kind and size, over all channels or of one."""
+    """Sum up by kind and size, over all channels or for one."""
     lines = []
     for swept in plan.faults:
         scored = [
@@ -87,7 +92,7 @@ def lines_of(tried: Subject, plan: Plan, channel: int | None = None) -> list[Lin
             str(kind.value): sum(one.outcome is kind for one in scored)
             for kind in OutcomeKind
         }
-        # A fault that went with a false isolation was not found in any useful way.
+        # A fault with a wrong isolation does not count as found.
         good = [
             one
             for one in scored
@@ -105,7 +110,7 @@ def lines_of(tried: Subject, plan: Plan, channel: int | None = None) -> list[Lin
 
 
 def _quantiles(delays: Sequence[float], trials: int, within: float) -> Delays:
-    """Quantiles of the delays of all trials; those without a delay in time are beyond all others."""
+    """Return quantiles of the delays. Trials without a delay in time count as infinite."""
     if not trials:
         return Delays(math.nan, math.nan)
     known = sorted(delay for delay in delays if delay <= within)
@@ -114,7 +119,7 @@ def _quantiles(delays: Sequence[float], trials: int, within: float) -> Delays:
 
 
 def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
-    """For each kind with sizes: the smallest from which on this size and all larger ones are found, or named."""
+    """Return for each kind the smallest size from which on all sizes are found, or isolated."""
     found = {family: _smallest(own, named) for family, own in _families(lines).items()}
     return {
         family: None if line is None else line.swept.size
@@ -123,7 +128,7 @@ def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
 
 
 def _families(lines: Sequence[Line]) -> dict[str, list[Line]]:
-    """Lines of each kind of which a larger size is a larger fault, in the order of size."""
+    """Return the lines of each kind whose faults grow with their size, in the order of size."""
     families: dict[str, list[Line]] = {}
     for line in lines:
         if (
@@ -145,7 +150,7 @@ def _smallest(lines: Sequence[Line], named: bool) -> Line | None:
 
 
 def sweep_figures(results: Sequence[Subject], plan: Plan, bag: str) -> dict[str, Any]:
-    """Return all figures of a sweep: what its JSON file holds."""
+    """Return all figures of a sweep, for the JSON file."""
     monitors = [_monitor_figures(tried, plan) for tried in results]
     return {
         "bag": bag,
@@ -185,7 +190,7 @@ def _monitor_figures(tried: Subject, plan: Plan) -> dict[str, Any]:
 
 
 def declared_figures(baseline: Baseline | None) -> list[dict[str, object]]:
-    """Return what was declared of a recording as it is."""
+    """Return the declarations without injected faults."""
     declared = [] if baseline is None else baseline.declared
     return [
         {"at_s": one.at_s, "channel": one.channel, "state": one.state}
@@ -194,7 +199,7 @@ def declared_figures(baseline: Baseline | None) -> list[dict[str, object]]:
 
 
 def _line_figures(line: Line) -> dict[str, Any]:
-    """Return what came of a fault beside its kind and numbers."""
+    """Return the results for a fault."""
     return {
         "kind": line.swept.kind,
         **{name: float(value) for name, value in line.swept.items},
@@ -241,14 +246,15 @@ def write_csv(file: IO[str], results: Iterable[Subject], plan: Plan) -> None:
             )
 
 
-# In words and tables --------------------------------------------------------------------------------------------------
+# Words and tables
 
 
-MOVES = 0.1  # rate that a vehicle which is not at rest reaches while a fault is watched, rad/s
+MOVES = 0.1
+"""Largest rate during a fault from which on the vehicle counts as moving, rad/s."""
 
 
 def smallest_hint(plan: Plan) -> str:
-    """Say what the smallest sizes are, and the figures in brackets."""
+    """Explain the smallest sizes and the figures in brackets."""
     return (
         f"smallest size of which at least {WANTED:.0%} of the faults were detected within"
         f" {plan.within:g} s; in brackets: detected, tried, 95 % interval"
@@ -280,7 +286,7 @@ def figures_section(tried: Subject, plan: Plan) -> Section:
 
 
 def sound_lines(tried: Subject) -> list[str]:
-    """Say what the monitor makes of the recording as it is, and what follows for the rest."""
+    """Describe the result without injected faults, and its consequences."""
     baseline = tried.baseline
     if baseline is None or tried.refused:
         return [f"not tried: {tried.refused}"]
@@ -320,7 +326,7 @@ def sound_lines(tried: Subject) -> list[str]:
 
 
 def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
-    """Give the smallest size of each kind that is found."""
+    """Return the smallest size of each kind that is found, in words."""
     if not tried.trials:
         return []
     lines, words = lines_of(tried, plan), []
@@ -336,7 +342,7 @@ def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
         "wrong declaration (a healthy channel, or a set without the faulty one):"
         f" {false} of {len(tried.trials)} faults"
     )
-    # At rest small faults are found that are lost in flight.
+    # At rest smaller faults are found than in flight.
     moving, times = sum(speed > MOVES for speed in tried.speeds), len(tried.times)
     motion = (
         f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
@@ -346,7 +352,7 @@ def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
 
 
 def _from(lines: Sequence[Line], named: bool) -> str:
-    """Say from what size on, and of how many faults that is known: of a few, the share is far from certain."""
+    """Return the smallest size that is found, with the interval of its share."""
     found = _smallest(lines, named)
     line = found or lines[-1]
     count, size = line.count(named), f"{line.swept.size:g} {line.swept.unit}".rstrip()
@@ -376,7 +382,7 @@ HINTS = [
 
 
 def sweep_text(results: Sequence[Subject], plan: Plan, bag: str) -> str:
-    """Everything, for a terminal."""
+    """Return all results for a terminal."""
     tried = [one for one in results if one.trials]
     count = sum(len(one.trials) for one in tried)
     sections = _as_they_are(results, plan)
@@ -392,7 +398,7 @@ def sweep_text(results: Sequence[Subject], plan: Plan, bag: str) -> str:
 
 
 def _as_they_are(results: Sequence[Subject], plan: Plan) -> list[Section]:
-    """Tell of each monitor without a fault, and of all side by side with faults."""
+    """Lay out each monitor without faults, and all side by side with faults."""
     sections = [
         Section(f"{one.name}, nothing injected", "", sound_lines(one))
         for one in results
@@ -407,10 +413,11 @@ def _as_they_are(results: Sequence[Subject], plan: Plan) -> list[Section]:
     return sections
 
 
-# The page ------------------------------------------------------------------------------------------------------------
+# The page
 
 
-LEAST_SIZES = 3  # of a kind for a curve; the map and the table show fewer as well
+LEAST_SIZES = 3
+"""Smallest number of sizes of a kind for a curve."""
 Curve = tuple[
     str, str, Callable[[Line], float]
 ]  # name, dash and values of a line of a plot
@@ -419,7 +426,7 @@ Curve = tuple[
 def sweep_page(
     results: Sequence[Subject], plan: Plan, bag: str, about: Mapping[str, str]
 ) -> str:
-    """Lay out everything."""
+    """Lay out the page of a sweep."""
     tried = [one for one in results if one.trials]
     sections = [*_as_they_are(results, plan), *_curves(tried, plan)]
     for one in tried:
@@ -434,7 +441,7 @@ def _summary(results: Sequence[Subject], plan: Plan) -> list[str]:
         before = f"{one.name}: " if len(results) > 1 else ""
         lines += [f"{before}nothing injected: {line}." for line in sound_lines(one)[:1]]
         verdict = verdict_lines(one, plan)
-        # Of several, the table side by side says the rest.
+        # With several monitors the table side by side has these figures.
         lines += [
             f"{before}{line}."
             for line in (
@@ -445,7 +452,7 @@ def _summary(results: Sequence[Subject], plan: Plan) -> list[str]:
 
 
 def _curves(tried: Sequence[Subject], plan: Plan) -> list[Section]:
-    """Draw shares and delays of each kind that has several sizes."""
+    """Draw shares and delays of each kind with several sizes."""
     shares: list[Curve] = [
         ("isolated", "solid", lambda line: 100 * line.isolated.value),
         ("detected", "dash", lambda line: 100 * line.detected.value),
@@ -490,7 +497,7 @@ def _figure(
     curves: Sequence[Curve],
     yaxis: dict[str, Any],
 ) -> Figure:
-    """Draw the curves of each monitor against the size of the faults."""
+    """Draw the curves of each monitor over the size of the faults."""
     alone, unit = len(monitors) == 1, next(iter(monitors.values()))[0].swept.unit
     data = [
         {
@@ -510,7 +517,7 @@ def _figure(
 
 
 def _map(one: Subject, plan: Plan) -> Section:
-    """Share found by channel and fault, as shades and figures."""
+    """Draw the share that is found, by channel and fault."""
     rows = [lines_of(one, plan, channel) for channel in one.used]
     found = [[round(line.detected.value, 2) for line in lines] for lines in rows]
     names, words = (

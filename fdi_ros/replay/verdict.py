@@ -3,7 +3,7 @@
 
 """The verdict on a replay: one word, and a sentence for the person who flies.
 
-`verdict_of` decides; `fdi replay`, its page, `fdi fleet` and Python only repeat it.
+`verdict_of` decides. `fdi replay`, its page, `fdi fleet` and Python repeat its result.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MOST_CONCERNS = 3
 
 
 def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
-    """Return the verdict on what a monitor made of a stream, with rates in a unit."""
+    """Return the verdict on a judged stream, with rates in the given unit."""
     if judgement.scores.faults:
         return _verdict_on_faults(judgement)
     faulty = faulty_episodes(judgement)
@@ -56,9 +56,9 @@ def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
 
 
 def faulty_episodes(judgement: Judgement) -> list[Episode]:
-    """Return the episodes that make a recording faulty, those that name channels first.
+    """Return the episodes that make a recording FAULTY, isolated channels first.
 
-    These are the declarations, and the units that are silent to the end.
+    These are the declarations, and units that are silent to the end.
     """
     declared = sorted(
         judgement.story.declared, key=lambda one: (one.state != "FAULTY", one.start_s)
@@ -75,7 +75,7 @@ def faulty_episodes(judgement: Judgement) -> list[Episode]:
 
 
 def unjudged_words(judgement: Judgement) -> str:
-    """Return why the recording as a whole was not judged, in words; empty: it was."""
+    """Return why the recording as a whole was not judged. Empty: it was judged."""
     scores, bias = judgement.scores, judgement.monitor.bias
     if scores.samples_judged == 0:
         return (
@@ -93,7 +93,7 @@ def unjudged_words(judgement: Judgement) -> str:
 
 
 def wrongly_named(judgement: Judgement) -> list[str]:
-    """Return the channels declared by themselves that no injected fault strikes."""
+    """Return the channels that were declared alone without an injected fault."""
     faulty = dict.fromkeys(
         one.channel for one in judgement.scores.declared if one.state == "FAULTY"
     )
@@ -101,7 +101,7 @@ def wrongly_named(judgement: Judgement) -> list[str]:
 
 
 def _verdict_on_faults(judgement: Judgement) -> ReplayVerdict:
-    """Say how many of the injected faults were detected."""
+    """Return the verdict on injected faults."""
     faults = judgement.scores.faults
     isolated = judgement.scores.isolated
     detected = sum(fault.detected_at_s is not None for fault in faults)
@@ -159,7 +159,7 @@ def _faulty_sentences(faulty: Sequence[Episode], unit: Unit) -> str:
 
 
 def _who(one: Episode) -> str:
-    """Return the channels as they are said aloud: ``imu_0, x and y,``."""
+    """Return the channels as spoken: ``imu_0, x and y,``."""
     parts = [name.rpartition(".") for name in one.channels]
     units = {unit for unit, _, _ in parts}
     if one.state == "AMBIGUOUS" and len(parts) > 1:
@@ -196,7 +196,7 @@ def _when(one: Episode) -> str:
 
 
 def _size_sentences(one: Episode, unit: Unit) -> list[str]:
-    """Return how large the error is, in a sentence."""
+    """Return a sentence on the size of the error."""
     unit = unit_for(one, unit)
     if one.apart is not None:
         return [f"They are {_size(one.apart.size, unit)} {unit.name} apart."]
@@ -232,7 +232,7 @@ def _size_sentences(one: Episode, unit: Unit) -> list[str]:
 
 
 def _size_words(size: Size, unit: Unit) -> str:
-    """Return what an error does, as it continues ``It``; empty: too small to measure."""
+    """Describe an error, as it continues ``It``. Empty: too small to measure."""
     value = _size(size, unit)
     if size.course == "proportional":
         share = 100.0 * abs(size.share_of_rate or 0.0)
@@ -253,7 +253,7 @@ def _size_words(size: Size, unit: Unit) -> str:
 
 
 def _reason_sentences(one: Episode) -> list[str]:
-    """Return the reason of a fault that is more than a disagreement."""
+    """Return a sentence on the reason, unless the reason is a mere disagreement."""
     reason = one.evidence.reason
     common = (Reason.DISAGREES.value, Reason.DRIFTED.value, Reason.NO_DATA.value)
     if one.state != "FAULTY" or not reason or reason.startswith(common):
@@ -266,7 +266,7 @@ def _size(size: Size, unit: Unit) -> str:
 
 
 def _rate(value: float, std: float, unit: Unit) -> str:
-    """Write the size of a rate to the figure that its standard error allows, three at most."""
+    """Format a rate with the digits that its standard error allows, at most three."""
     size, error = abs(value) * unit.factor, std * unit.factor
     figures = 2 - math.floor(math.log10(size)) if size > 0.0 else 0
     if error > 0.0 and math.isfinite(error):

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sentences and tables of a replay for a terminal; the verdict itself is in `verdict`."""
+"""Sentences and tables of a replay for a terminal. The verdict itself is in `verdict`."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _name_lines(summary: Summary) -> list[str]:
 
 
 def unchecked_words(channels: Sequence[ChannelResult]) -> str:
-    """Say which channels end in which state, since when, and why."""
+    """Describe the last state of channels, with its time and reason."""
     alike: dict[tuple[str, str], list[ChannelResult]] = {}
     for one in channels:
         alike.setdefault((one.state, one.reason), []).append(one)
@@ -106,7 +106,7 @@ def unchecked_words(channels: Sequence[ChannelResult]) -> str:
 
 
 def _unchecked_lines(summary: Summary) -> list[str]:
-    """Say which channels were not checked at the end."""
+    """Name the channels that were not checked at the end."""
     lost = [
         one
         for one in summary.unchecked_channels
@@ -116,7 +116,7 @@ def _unchecked_lines(summary: Summary) -> list[str]:
 
 
 def notes(summary: Summary) -> list[str]:
-    """Return what else matters: damage, messages left out, limits of the monitor."""
+    """Return notes on damage, unused messages and limits of the monitor."""
     stream, scores = summary.stream, summary.scores
     lines = [*stream.damage, *sample_rate_notes(stream.sample_rate)]
     lines += [
@@ -155,7 +155,7 @@ def sample_rate_notes(rate: SampleRate) -> list[str]:
 
 
 def _detection_words(fault: Outcome) -> str:
-    """Say when an injected fault was detected and isolated, and which channels were declared."""
+    """Describe detection and isolation of an injected fault."""
     if fault.detected_at_s is None:
         before = "not counted, because its channels were already declared"
         return before if fault.declared_before else "not detected"
@@ -172,7 +172,7 @@ def _detection_words(fault: Outcome) -> str:
 
 
 def _unexplained_lines(summary: Summary, unit: Unit) -> list[str]:
-    """Say what was declared that the injected faults do not explain."""
+    """Describe declarations that no injected fault explains."""
     scores, story = summary.scores, summary.story
     unexplained = [one for one in story.declared if not one.injected]
     if unexplained:
@@ -263,7 +263,7 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
 
 
 def _noise(channels: Sequence[ChannelResult], unit: Unit) -> float | None:
-    """Return the largest difference from the fused value, rms, of the channels measured in a unit."""
+    """Return the largest rms residual of the channels measured in a unit. None: not measured."""
     known = [
         one.residual_rms_rad_s * unit.factor
         for one in channels
@@ -280,7 +280,7 @@ def _temperature_words(span: tuple[float, float] | None) -> str:
 def _trouble_words(
     summary: Summary, unit: str, channels: Sequence[ChannelResult]
 ) -> str:
-    """Say since when the unit is not healthy; a dash: it is."""
+    """Describe the troubles of a unit. A dash: none."""
     own = [one.name for one in channels]
     names = {unit, *own}
     faults = [
@@ -298,7 +298,7 @@ def _trouble_words(
 
 
 def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
-    """Lay out the injected faults, their outcome and effect; no section without faults."""
+    """Lay out the injected faults with their results and effect. Empty: no faults."""
     if not scores.faults:
         return []
     columns: Columns = {
@@ -345,7 +345,7 @@ def _detected(fault: Outcome) -> str:
 
 
 def size_of(fault: Outcome, unit: Unit = RADIANS) -> str:
-    """Return the size of a fault with its unit; a rate in the unit asked for."""
+    """Return the size of a fault with its unit, and rates in the given unit."""
     if fault.size is None:
         return "-"
     option = FAULT_KINDS[fault.kind].options()["size"].unit

@@ -277,10 +277,10 @@ def test_excluded_channels_are_not_tried(fdi, tmp_path):
         (["--within", "nan"], "--within is nan s, expected more than 0"),
         (["--workers", "0"], "workers is 0, expected 1 to 256"),
         (["--seed", "-1"], "--seed is -1"),
-        (["--compare", "nothing"], "no such file, and no detector"),
+        (["--compare", "nothing"], "neither a file nor a detector"),
         (
             ["--compare", str(ROOT / "config" / "three_imus.yaml")],
-            "its channels are not those of",
+            "its channels differ from those of",
         ),
     ],
 )

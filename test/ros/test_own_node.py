@@ -368,10 +368,10 @@ def test_what_is_odd_about_clocks_is_named_and_lived_with(tmp_path) -> None:
         # One clock behind the other.
         listener.calm()
         listener.play(healthy(500)[1], skew=-40_000_000)
-        said = listener.says("input imu_2", "behind the other inputs'")
+        said = listener.says("input imu_2", "behind those of the other inputs")
         assert wait(lambda: len(listener.fused) > 450)
         # Ten samples behind; nine where the one of the other unit came after it.
-        assert 32 <= float(re.search(r"stay ([\d.]+) ms behind", said)[1]) <= 40.1
+        assert 32 <= float(re.search(r"stamps are ([\d.]+) ms behind", said)[1]) <= 40.1
         # The clock is set right, and an operator says that all is well. Nor does a gap leave anything behind.
         assert listener.trigger("reset").success
         assert listener.settle()
