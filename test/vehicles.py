@@ -117,8 +117,24 @@ def vehicle(seed, kind, units=3, sample_rate=100.0):
     )
 
 
+@dataclass(frozen=True)
+class Forces:
+    """A recording with accelerometers, and the truth behind them."""
+
+    block: Block
+    axes: Array
+    """(n, 3) of the accelerometers."""
+    bias: Array
+    """(n,) m/s^2."""
+
+
 def with_forces(one, arms, noise=0.05, seed=0):
-    """Return the recording of a vehicle with accelerometers at arms (units, 3), m; errors of m/s^2 and 0.5 %."""
+    """Return the recording of a vehicle with accelerometers, as `forces_of` does."""
+    return forces_of(one, arms, noise, seed).block
+
+
+def forces_of(one, arms, noise=0.05, seed=0):
+    """Add accelerometers at arms (units, 3), m, to a vehicle; errors of 0.2 m/s^2 and 0.5 %."""
     rng, t = np.random.default_rng([21, seed]), (one.block.stamp - START) * 1e-9
     step, z = 2e-3, np.empty((len(t), len(arms), 3))
     fine = np.arange(-DELAY - 0.01, t[-1] + DELAY + 0.01, step)
@@ -128,11 +144,14 @@ def with_forces(one, arms, noise=0.05, seed=0):
         attitude[k] = turn.inv().apply([0.0, 0.0, 9.81])
         turn = turn * step_turn
     alpha = np.gradient(rate, step, axis=0)
+    axes, bias = np.empty((len(arms), 3, 3)), np.empty((len(arms), 3))
     for k, arm in enumerate(arms):
         force = attitude + np.cross(alpha, arm) + np.cross(rate, np.cross(rate, arm))
         at = np.column_stack([np.interp(t - one.late[k], fine, f) for f in force.T])
-        own = one.axes[3 * k : 3 * k + 3] + rng.normal(0, SCALE, (3, 3))
-        z[:, k] = at @ own.T + rng.normal(0, 0.2, 3)
+        axes[k] = one.axes[3 * k : 3 * k + 3] + rng.normal(0, SCALE, (3, 3))
+        bias[k] = rng.normal(0, 0.2, 3)
+        z[:, k] = at @ axes[k].T + bias[k]
     z += noise * rng.standard_normal(z.shape)
     force = Block(one.block.stamp, z.reshape(len(t), -1))
-    return replace(one.block, acceleration=force)
+    block = replace(one.block, acceleration=force)
+    return Forces(block, axes.reshape(-1, 3), bias.ravel())

@@ -304,12 +304,15 @@ def _check_accelerometers(config: Config) -> None:
         raise ConfigError(
             f"accelerometers.enabled is 'on', but input is {config.input!r} without channels.acceleration_topic"
         )
-    of_array = {"channels.acceleration_topic": topic, "accelerometers.axes": own.axes}
-    for name, value in of_array.items():
-        if value and config.has_units:
-            raise ConfigError(
-                f"{name} is given, but input is {config.input!r}: expected input 'channels'"
-            )
+    if topic and config.has_units:
+        raise ConfigError(
+            f"channels.acceleration_topic is given, but input is {config.input!r}: expected input 'channels'"
+        )
+    of_units = 9 * len(config.topics)
+    if own.axes and config.has_units and len(own.axes) != of_units:
+        raise ConfigError(
+            f"accelerometers.axes has {len(own.axes)} numbers, expected {of_units} (9 per unit)"
+        )
     if len(own.axes) % 3:
         raise ConfigError(
             f"accelerometers.axes has {len(own.axes)} numbers, expected 3 per accelerometer"

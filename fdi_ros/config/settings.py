@@ -552,9 +552,18 @@ class AccelerometersConfig:
         1.0,
         1e5,
     )
+    bias: tuple[float, ...] = setting(
+        (),
+        "bias of each accelerometer, as `fdi setup` measures it against the others; empty: 0",
+        "m/s^2",
+        -100.0,
+        100.0,
+        per="accelerometer",
+        other_lengths=(0,),
+    )
     axes: tuple[float, ...] = setting(
         (),
-        "sensitivity axes of the accelerometers of an array, 3 numbers each, norm 0.5 to 2; empty: those of the gyros",
+        "sensitivity axes of the accelerometers, 3 numbers each, norm 0.5 to 2; empty: those of the gyros",
         "",
         -2.0,
         2.0,

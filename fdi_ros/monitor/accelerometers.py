@@ -25,8 +25,6 @@ from fdi_ros.model.samples import Array, Block
 FORETOLD_FORCE, FORETOLD_CHANGE = 20.0, 200.0
 #: standard deviation of a position along an axis where none is given, m
 UNKNOWN_POSITION = 0.02
-#: not used: accelerometers are never at rest
-NO_AVERAGE: dict[str, Value] = {"bias.startup_bias_duration": 0.0, "bias.fixed": ()}
 
 
 def possible_units(config: Config, gyros: int) -> range:
@@ -101,7 +99,9 @@ def accelerometer_config(config: Config, units: Sequence[int]) -> Config:
         "health.max_rate": scaled(own.max_acceleration),
         "integrity.max_rate": FORETOLD_FORCE / FORCE.natural,
         "integrity.max_acceleration": FORETOLD_CHANGE / FORCE.natural,
-        **NO_AVERAGE,
+        "bias.fixed": scaled(own.bias),
+        # Accelerometers are never at rest.
+        "bias.startup_bias_duration": 0.0,
         **(_unit_settings if config.has_units else _array_settings)(config, units),
     }
     return config.replaced(changes)
@@ -110,6 +110,7 @@ def accelerometer_config(config: Config, units: Sequence[int]) -> Config:
 def _unit_settings(config: Config, units: Sequence[int]) -> dict[str, Value]:
     """Return what the accelerometers have in common with the gyros of their units."""
     imus, noise, chosen = config.imus, config.noise, places(config, units)
+    axes = config.accelerometers.axes
 
     def of_channels(values: Sequence[float]) -> tuple[float, ...]:
         return tuple(values[i] for i in chosen) if len(values) > 1 else tuple(values)
@@ -125,7 +126,8 @@ def _unit_settings(config: Config, units: Sequence[int]) -> dict[str, Value]:
         "imus.names": of_units(config.imu_names),
         "imus.mounts": of_units(imus.mounts, 9),
         "imus.delays": of_units(imus.delays),
-        "geometry.axes": of_units(config.geometry.axes, 9),
+        "geometry.axes": of_units(axes or config.geometry.axes, 9),
+        "geometry.preset": "axes" if axes else config.geometry.preset,
         "noise.timing_std": of_channels(noise.timing_std),
         "integrity.fault_rate": of_channels(config.integrity.fault_rate),
     }

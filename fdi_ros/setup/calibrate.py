@@ -11,19 +11,25 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fdi_ros.config.config import Config
-from fdi_ros.config.settings import LEAST_NOISE
+from fdi_ros.config.settings import LEAST_NOISE, Value
 from fdi_ros.core.sources import source_of
-from fdi_ros.errors import CalibrationError, ConfigError, DisagreementError
+from fdi_ros.errors import (
+    CalibrationError,
+    ConfigError,
+    DisagreementError,
+    FdiError,
+)
 from fdi_ros.inspection.turns import LEAST_ROTATION, LEAST_WINDOWS
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.samples import Array, Block, Int
+from fdi_ros.model.samples import Array, Block, Int, Mask
 from fdi_ros.monitor.building import (
     CHANNEL_DELAY,
     UNIT_DELAY,
@@ -34,6 +40,12 @@ from fdi_ros.monitor.output import ChannelState, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Kept, Walk
 from fdi_ros.report.spectrum import Spectrum
+from fdi_ros.setup.accelerometers import (
+    AccelerometerFit,
+    Prepared,
+    fit_accelerometers,
+    prepare_accelerometers,
+)
 from fdi_ros.setup.agreement import LEAST_RATE, SHOWN, check_agreement
 from fdi_ros.setup.blocks import (
     NOT_SHIFTED,
@@ -43,19 +55,20 @@ from fdi_ros.setup.blocks import (
     resampled,
     spikes,
 )
-from fdi_ros.setup.estimate import SCALE_STD, Priors, StateEstimate, estimate
-from fdi_ros.setup.noise import projector
+from fdi_ros.setup.channels import ChannelFit
+from fdi_ros.setup.estimate import (
+    REFERENCE_STD,
+    SCALE_STD,
+    Priors,
+    StateEstimate,
+    estimate,
+)
 from fdi_ros.setup.positions import Position, find_positions, position_settings
 
 #: of each component of an axis that may point anywhere: the root of a third
 UNKNOWN_MOUNT = 0.58
-#: uncertainty of the axes along a direction of the body from which they are not
-#: measured
-UNMEASURED = SCALE_STD / 2
 #: the same of an array, and the error from which axes follow the motion alone
 UNKNOWN_AXES = 0.1
-#: of channels that are taken for as configured
-REFERENCE_STD = 1e-6
 #: s, samples, and s from one to the next
 LEAST_DURATION, LEAST_SAMPLES, LONGEST_STEP = (
     10.0,
@@ -110,21 +123,14 @@ class Span(NamedTuple):
 
 
 @dataclass
-class Calibration:
-    """Result for the channels in use, in their order."""
+class Calibration(ChannelFit):
+    """Result for the gyros in use, in their order, and for the accelerometers beside them."""
 
-    names: tuple[str, ...]
-    #: (n, 3) as configured
-    nominal: Array
-    estimate: StateEstimate
     #: uncertainty of the sampling instants, s, as written
     timing: float
     #: of all units but the first
     delays: tuple[StampDelay, ...]
     faults: tuple[Span, ...]
-    #: (n,) samples of each channel that were not used, by the reason: as of `Data`, and
-    #: spikes
-    unusable: dict[str, Int]
     #: of the recording, s
     duration: float
     #: parameters to be changed, ``{"section.field": value}``
@@ -133,42 +139,10 @@ class Calibration:
     spectrum: Spectrum
     #: of the accelerometers of all units but the first
     positions: tuple[Position, ...] = ()
-
-    def __post_init__(self) -> None:
-        found, n = self.estimate, len(self.names)
-        self.axes = axes = found.axes  # (n, 3)
-        self.axes_std = np.sqrt(np.diag(found.axes_covariance)).reshape(-1, 3)
-        self.bias_std = np.sqrt(
-            np.diag(found.bias_covariance)
-        )  # (n,) of the mean biases, rad/s
-        self.scale = (
-            found.disagreement()
-        )  # scale error left between channels, as written, and its uncertainty
-        # (n,) angle between calibrated and nominal axes, rad, and its standard error in each of two directions.
-        sine = np.linalg.norm(np.cross(axes, self.nominal), axis=1)
-        self.angle = np.arctan2(sine, (axes * self.nominal).sum(axis=1))
-        length = np.linalg.norm(axes, axis=1)
-        each, along = found.axes_covariance.reshape(n, 3, n, 3), axes / length[:, None]
-        # (n,) scale factor relative to nominal, and its standard error.
-        self.factor = length / np.linalg.norm(self.nominal, axis=1)
-        square = np.einsum("ia,iab,ib->i", along, each[range(n), :, range(n)], along)
-        self.factor_error = np.sqrt(np.maximum(square, 0))
-        across = (self.axes_std**2).sum(axis=1) - self.factor_error**2
-        self.angle_error = np.sqrt(np.maximum(across, 0) / 2) / length
-        # (3,) uncertainty of the disagreement of axes along x, y and z of the body.
-        apart = projector(axes)
-        squares = [
-            np.trace(apart @ each[:, a, :, a] @ apart) / max(n - 3, 1) for a in range(3)
-        ]
-        self.axis_errors = np.sqrt(np.maximum(squares, 0.0))
-        # (n,) channels whose scale factor the recording shows, against the others.
-        self.measured = np.sqrt(along**2 @ self.axis_errors**2) < UNMEASURED
-        # Channels of each unit. Channels of an array form units of one.
-        unit_of = [name.rpartition(".")[0] or name for name in self.names]
-        self.units = [
-            [i for i, one in enumerate(unit_of) if one == unit]
-            for unit in dict.fromkeys(unit_of)
-        ]
+    #: None if units have no accelerometers, or these cannot be calibrated
+    accelerometers: AccelerometerFit | None = None
+    #: why accelerometers are not calibrated, or empty
+    refused: str = ""
 
 
 def calibrate(
@@ -178,7 +152,7 @@ def calibrate(
 
     ``reference``: a triad, or three channels with commas, taken as configured. Empty
     trusts all alike, and in an array the first three that span space. ``unknown``:
-    channels with unknown mounts. `FdiError` if the recording is too short, or channels
+    channels with unknown mounts. `FdiError` if the recording is too short, or gyros
     contradict each other.
     """
     full = build_geometry(config)
@@ -187,34 +161,35 @@ def calibrate(
     )
     active, nominal = np.flatnonzero(used), full.subset(used)
     chosen = reference_channels(config, nominal, reference)
-    rates = np.broadcast_to(np.array(config.health.max_rate), full.n)
-    data = prepare(
-        Block(block.stamp, block.z[:, used], block.delivered[:, used]), rates[used]
-    )
-    _check_amount(data, nominal.channel_names)
-    spiky = spikes(data.z, nominal.axes)
-    data.z[spiky] = np.nan
+    data, spiky = _prepared(block, config, used, nominal)
     lost = np.flatnonzero(np.isin(active, unknown)).tolist()
     if source_of(config).units:
         check_agreement(data, nominal, lost)
     sensors = _sensors(config, nominal, data, chosen, lost)
+    trusted = {nominal.channel_names[i].rpartition(".")[0] for i in chosen}
     try:
         found = estimate(data, sensors)
-        tried = config.replaced(_settings(config, active, data.step, found))
-        z, received = block.z.copy(), block.delivered.copy()
-        # As the monitor will have them once the delays are taken off.
-        still = np.isfinite(data.z) & (np.abs(found.delay) < NOT_SHIFTED)
-        z[:, used] = np.where(still, data.z, resampled(data, found.delay)[0])
-        # The value of another instant is no substitute.
-        received[:, used] = np.isfinite(z[:, used])
-        faults, spectrum = _watch(Block(block.stamp, z, received), tried, active)
+        beside = _Beside(block, config, active, data.step, tuple(trusted), found)
+        samples = _as_monitored(block, data, used, found, beside.ready)
+        faults, spectrum = _watch(samples, beside.config, beside.names)
+        n = len(active)
+        of_gyros = tuple(span for span in faults if min(span.channels) < n)
+        of_forces = tuple(
+            span._replace(channels=tuple(i - n for i in span.channels))
+            for span in faults
+            if min(span.channels) >= n
+        )
+        if of_gyros:
+            without = _without(of_gyros, data, nominal.channel_names)
+            found = estimate(without, sensors)
         if faults:
-            found = estimate(_without(faults, data, nominal.channel_names), sensors)
+            beside = _Beside(
+                block, config, active, data.step, tuple(trusted), found, of_forces
+            )
     except np.linalg.LinAlgError as error:
         raise CalibrationError(
             f"the recording leaves the fit undetermined ({error})"
         ) from error
-    positions = find_positions(block, config, found)
     units = [
         tuple(np.flatnonzero(sensors.unit == k).tolist())
         for k in range(1, sensors.units)
@@ -230,14 +205,81 @@ def calibrate(
             )
             for unit in units
         ),
-        faults=faults,
+        faults=of_gyros,
         unusable=data.unusable | {"spikes": np.asarray(spiky.sum(axis=0))},
         duration=len(data.stamp) * data.step,
-        settings=_settings(config, active, data.step, found)
-        | position_settings(positions, config),
+        settings=beside.settings,
         spectrum=spectrum,
-        positions=positions,
+        positions=beside.positions,
+        accelerometers=beside.fit,
+        refused=beside.refused,
     )
+
+
+def _prepared(
+    block: Block, config: Config, used: Mask, nominal: Geometry
+) -> tuple[Data, Mask]:
+    """Return the usable values of gyros in use, and the spikes (N, n) among them."""
+    rates = np.broadcast_to(np.array(config.health.max_rate), len(used))
+    data = prepare(
+        Block(block.stamp, block.z[:, used], block.delivered[:, used]), rates[used]
+    )
+    _check_amount(data, nominal.channel_names)
+    spiky = spikes(data.z, nominal.axes)
+    data.z[spiky] = np.nan
+    return data, spiky
+
+
+class _Beside:
+    """Positions and fit of the accelerometers beside calibrated gyros, and all settings."""
+
+    def __init__(
+        self,
+        block: Block,
+        config: Config,
+        active: Int,
+        step: float,
+        trusted: Sequence[str],
+        gyros: StateEstimate,
+        faults: tuple[Span, ...] = (),
+    ) -> None:
+        self.positions = find_positions(block, config, gyros)
+        self.settings = _settings(config, active, step, gyros)
+        self.settings |= position_settings(self.positions, config)
+        self.config = config.replaced(self.settings)
+        self.ready: Prepared | None = None
+        self.fit: AccelerometerFit | None = None
+        self.refused = ""
+        names = build_geometry(config).channel_names
+        self.names = tuple(names[i] for i in active)
+        try:
+            self.ready = prepare_accelerometers(block, self.config, gyros, trusted)
+            if self.ready is not None:
+                of_faults = partial(_without, faults)
+                self.fit = fit_accelerometers(
+                    self.ready, self.config, of_faults, faults
+                )
+        except (FdiError, np.linalg.LinAlgError) as error:
+            self.refused = str(error)
+        if self.fit is not None:
+            self.settings |= self.fit.settings
+            self.config = self.config.replaced(self.fit.settings)
+            self.names += self.fit.names
+
+
+def _as_monitored(
+    block: Block, data: Data, used: Mask, found: StateEstimate, beside: Prepared | None
+) -> Block:
+    """Return the samples as the monitor will have them once delays are taken off."""
+    z, received = block.z.copy(), block.delivered.copy()
+    still = np.isfinite(data.z) & (np.abs(found.delay) < NOT_SHIFTED)
+    z[:, used] = np.where(still, data.z, resampled(data, found.delay)[0])
+    # The value of another instant is no substitute.
+    received[:, used] = np.isfinite(z[:, used])
+    forces = None
+    if beside is not None:
+        forces = beside.as_monitored(block.stamp, block.z.shape[1])
+    return Block(block.stamp, z, received, forces)
 
 
 def _check_amount(data: Data, names: tuple[str, ...]) -> None:
@@ -324,47 +366,55 @@ def _sensors(
     units = list(dict.fromkeys(unit for unit in nominal.unit_of if unit)) or [""]
     unit = np.array([units.index(unit) if unit else 0 for unit in nominal.unit_of])
     delay = UNIT_DELAY if source.stamped else CHANNEL_DELAY
-    return Priors(
-        axes, unit, len(units), scale, max(config.bias.turn_on_std, 1e-6), delay
-    )
+    turn_on = max(config.bias.turn_on_std, 1e-6)
+    expected = np.zeros(len(units))
+    return Priors(axes, unit, len(units), scale, turn_on, delay, expected)
 
 
 class _Watched(Kept):
-    """Keeps channel states, and the spectrum of differences from the fused rate."""
+    """Keeps channel states, and the spectrum of differences of gyros from the fused rate."""
 
-    def __init__(self, names: Sequence[str], rate: float, active: Int) -> None:
-        super().__init__(lambda output: (output.stamp, output.state[:, active]))
-        self.spectrum = Spectrum(names, rate)
+    def __init__(self, gyros: Sequence[str], rate: float) -> None:
+        super().__init__(lambda output: (output.stamp, output.state))
+        self.spectrum = Spectrum(gyros, rate)
+        self.count = len(gyros)
 
     def begin_stretch(self) -> None:
         self.spectrum.begin_stretch()
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         super().add(block, output, pipeline)
-        self.spectrum.add(output.residual)
+        self.spectrum.add(output.residual[:, : self.count])
 
 
 def _watch(
-    block: Block, config: Config, active: Int
+    block: Block, config: Config, names: Sequence[str]
 ) -> tuple[tuple[Span, ...], Spectrum]:
-    """Return the declarations of the monitor with these settings, and the spectrum."""
-    # Declarations then end with their cause.
-    changes = {"decision.latch": False, "accelerometers.enabled": "off"}
+    """Return the declarations of the monitor of these channels, and the spectrum."""
+    # Declarations then end with their cause. What the turning of the body adds is off.
+    changes: dict[str, Value] = {
+        "decision.latch": False,
+        "accelerometers.positions": (),
+    }
     pipeline = Pipeline(config.replaced(changes))
-    watched = _Watched(pipeline.channel_names, config.sample_rate, active)
+    watched = _Watched(pipeline.channel_names, config.sample_rate)
     Walk(pipeline, [watched]).take(block)
-    stamp, state = watched.columns
+    known = pipeline.channel_names
+    stamp, states = watched.columns
+    state = states[:, [known.index(name) for name in names]]
     among = np.asarray(state == ChannelState.AMBIGUOUS)
     runs = [
         ([k], run)
         for k, states in enumerate(state.T)
         for run in flag_runs(states == ChannelState.FAULTY)
     ]
-    doubted = flag_runs(np.asarray(among.any(axis=1)))
-    runs += [
-        (np.flatnonzero(among[slice(*run)].any(axis=0)).tolist(), run)
-        for run in doubted
-    ]
+    of_forces = np.array([".accel_" in name for name in names])
+    for half in (~of_forces, of_forces):
+        doubted = np.asarray((among & half).any(axis=1))
+        runs += [
+            (np.flatnonzero((among & half)[slice(*run)].any(axis=0)).tolist(), run)
+            for run in flag_runs(doubted)
+        ]
     seconds = (stamp - stamp[0]) * 1e-9
     spans = [
         Span(tuple(channels), float(seconds[first]), float(seconds[end - 1]))

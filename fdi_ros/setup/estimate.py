@@ -61,6 +61,8 @@ from fdi_ros.setup.smoother import (
 #: of scale error and misalignment before anything is shown, in each component: 0.5 %
 #: and 0.5 deg
 SCALE_STD = 0.008
+#: of channels that are taken as configured
+REFERENCE_STD = 1e-6
 PASSES = 12
 TRUSTING = PASSES // 3
 """First passes, which take all motion for motion, because unknown delays and scale
@@ -101,7 +103,11 @@ ESTIMATED = (
 
 @dataclass(frozen=True)
 class Priors:
-    """Quantities to estimate, with their prior knowledge."""
+    """Quantities to estimate, with their prior knowledge.
+
+    For accelerometers a body rate stands for a specific force, in units of its natural
+    size, and an angular acceleration for its change.
+    """
 
     #: (n, 3) as configured
     axes: Array
@@ -115,6 +121,11 @@ class Priors:
     bias_std: float
     #: s
     delay_std: float
+    #: (units,) expected delays of the stamps, s; that of the first is known
+    delay: Array
+    rest: Mask | None = None
+    """(W,) windows at rest, where the rate is constant and not known to be zero. None: the
+    rate shows rest, and is zero there."""
 
 
 @dataclass(frozen=True)
@@ -173,74 +184,36 @@ class StateEstimate:
 
 def estimate(data: Data, sensors: Priors) -> StateEstimate:
     """Estimate all states from a recording."""
-    n, units = len(sensors.axes), sensors.units
-    motion = (
-        3 * n + units - 1
-    )  # of the constants, the first are those that motion shows
-    axes, biases, colour, priors = (
-        sensors.axes.copy(),
-        np.zeros((1, n)),
-        np.ones((2, n)),
-        sensors,
-    )
-    taken, moved = (
-        np.zeros(units),
-        np.inf,
-    )  # delays that are off the blocks, and by how much they were to be others
+    n = len(sensors.axes)
+    axes, biases, colour = sensors.axes.copy(), np.zeros((1, n)), np.ones((2, n))
+    priors = sensors
+    # Delays taken off the blocks, and the largest change in the last pass.
+    taken, moved = sensors.delay.copy(), np.inf
     blocks = make_blocks(data, taken[sensors.unit])
     walk: RandomWalk | None = None
     for number in range(PASSES):
         one = _Pass(blocks, priors, axes, taken, biases, number > 1, colour)
-        if number > 1 and (
-            number == PASSES - 1 or (walk is None and moved < SHOWN_DELAY)
-        ):
+        is_last = number == PASSES - 1
+        if number > 1 and (is_last or (walk is None and moved < SHOWN_DELAY)):
             walk = find_random_walk(one.evidence)
-        usual = (
-            USUAL_WALK if walk is None else walk.value or min(walk.possible, USUAL_WALK)
-        )
-        shown = smooth(one.careful if number >= TRUSTING else one.evidence, usual)
-        found = smooth(
-            one.evidence,
-            usual,
-            (shown.constant[:motion], shown.constant_covariance[:motion, :motion]),
-        )
+        shown, found = one.solve(walk, number >= TRUSTING)
         scale = found.constant[: 3 * n].reshape(n, 3)
-        step = np.append(
-            0.0, np.clip(found.constant[3 * n : motion], -STEP_DELAY, STEP_DELAY)
-        )
+        step = np.clip(found.constant[3 * n : one.motion], -STEP_DELAY, STEP_DELAY)
         axes = axes + scale
-        delay, biases = (
-            np.clip(taken + step, -LARGEST_DELAY, LARGEST_DELAY),
-            one.curve_of(found),
-        )
+        delay = np.clip(taken + np.append(0.0, step), -LARGEST_DELAY, LARGEST_DELAY)
+        biases = one.curve_of(found)
         colour = one.colours(axes)
         moved = float(np.abs(delay - taken).max())
-        if (
-            number > TRUSTING
-            and walk is not None
-            and moved < SETTLED
-            and np.abs(scale).max() < SETTLED
-        ):
+        has_settled = moved < SETTLED and np.abs(scale).max() < SETTLED
+        if number > TRUSTING and walk is not None and has_settled:
             break
         if moved > SETTLED:
             taken = delay
             blocks = make_blocks(data, taken[sensors.unit])
-        # Where the axes are farther off than was supposed, they are not known as well either.
-        off = axes - sensors.axes
-        apart = off - axes @ (np.linalg.pinv(axes) @ off)
-        size = float(np.sqrt((apart**2).sum() / (3 * (n - 3))))
-        times = size / max(float(np.median(sensors.scale_std)), 1e-9)
-        priors = replace(
-            sensors,
-            scale_std=sensors.scale_std
-            * (times if times > WIDER and number >= TRUSTING else 1.0),
-        )
+        priors = _widened(sensors, axes) if number >= TRUSTING else sensors
     assert walk is not None
-    covariance = found.constant_covariance * misfit(one.careful, shown)
-    # No less is known than before.
-    known = np.minimum(1.0, one.careful.prior[n:] / np.sqrt(np.diag(covariance)))
-    covariance = covariance * np.outer(known, known)
-    delay_std = np.append(0.0, np.sqrt(np.diag(covariance)[3 * n : motion]))
+    covariance = _constant_covariance(one, shown, found)
+    delay_std = np.append(0.0, np.sqrt(np.diag(covariance)[3 * n : one.motion]))
     # Interpolation reduces white noise; the factor restores the residual.
     kept = np.sqrt(blocks.white)
     return StateEstimate(
@@ -260,6 +233,25 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
         one.rate,
         one.nonlinearity(sensors, axes, found.mean),
     )
+
+
+def _widened(sensors: Priors, axes: Array) -> Priors:
+    """Widen the prior of the axes where these are farther off than expected."""
+    off = axes - sensors.axes
+    apart = off - axes @ (np.linalg.pinv(axes) @ off)
+    size = float(np.sqrt((apart**2).sum() / (3 * (len(axes) - 3))))
+    times = size / max(float(np.median(sensors.scale_std)), 1e-9)
+    return replace(
+        sensors, scale_std=sensors.scale_std * (times if times > WIDER else 1.0)
+    )
+
+
+def _constant_covariance(one: _Pass, shown: Smoothed, found: Smoothed) -> Array:
+    """Return the covariance of the constants, enlarged by the misfit, at most the prior."""
+    covariance = found.constant_covariance * misfit(one.careful, shown)
+    prior = one.careful.prior[len(one.axes) :]
+    known = np.minimum(1.0, prior / np.sqrt(np.diag(covariance)))
+    return np.asarray(covariance * np.outer(known, known))
 
 
 class _Pass:
@@ -282,55 +274,74 @@ class _Pass:
         colour: Array,
     ) -> None:
         self.blocks, self.axes, self.window = blocks, axes, blocks.window
-        finite = np.isfinite(blocks.mean)
-        present = (
-            np.add.reduceat(finite, blocks.start, axis=0)
-            >= PRESENT * blocks.size[:, None]
-        )
-        # Blocks (B,) with all channels that are present in their window.
-        self.used: Mask = np.asarray((finite | ~present[self.window]).all(axis=1))
-        y = np.where(finite & present[self.window], blocks.mean, 0.0)
-        count = np.add.reduceat(self.used, blocks.start)
-        mean = (
-            np.add.reduceat(y * self.used[:, None], blocks.start, axis=0)
-            / np.maximum(count, 1)[:, None]
-        )
-        apart = (y - mean[self.window]) * self.used[:, None]
-        covariance = (
-            self._by_window(apart, apart) / np.maximum(count - 1, 1)[:, None, None]
-        )
-        enough = count >= LEAST_BLOCKS
-        # (W, n), the second for channels with usable single samples.
-        self.present = present & enough[:, None]
-        self.sampled = (
-            self.present
-            & np.isfinite(np.einsum("wii->wi", blocks.samples))
-            & (blocks.count > 3)[:, None]
-        )
-        moment = of_the_moment(covariance, self.present, axes)
-        self.floor = find_floor(blocks.samples, blocks.count, self.sampled, axes)
+        #: number of constants that motion shows, the first of all
+        self.motion = 3 * len(axes) + sensors.units - 1
+        y, moment = self._noise_of_windows()
         steady = np.where(self.present, moment, ABSENT)
-        # Expand the biases of joined windows to all windows.
-        bias = np.repeat(biases, -(-blocks.windows // len(biases)), axis=0)[
-            : blocks.windows
-        ]
         gain = gains(steady, axes)
+        # Expand the biases of joined windows to all windows.
+        each = -(-blocks.windows // len(biases))
+        bias = np.repeat(biases, each, axis=0)[: blocks.windows]
         self.rate: Array = np.einsum(
             "bai,bi->ba", gain[self.window], y - bias[self.window]
         )
-        self.rest = self._find_rest(gain, steady, known)
+        own = sensors.rest is None
+        self.rest: Mask = (
+            self._find_rest(gain, steady, known)
+            if sensors.rest is None
+            else sensors.rest
+        )
+        #: (W,) windows with a rate that is known to be zero
+        self.still: Mask = self.rest if own else np.zeros_like(self.rest)
         # (W, n) of a block, (rad/s)^2, coloured noise counted in.
         factor = np.where(self.rest[:, None], colour[0], colour[1])
         self.variance: Array = np.where(self.present, moment * factor, ABSENT)
-        # Angular acceleration, rad/s^2, 0 where unknown.
-        acceleration, inside = (
-            np.zeros_like(self.rate),
-            np.zeros(len(self.rate), dtype=bool),
+        acceleration = self._accelerations()
+        self._join_windows()
+        self.evidence, self.careful = self._find_evidence(
+            sensors, delay, y, acceleration
         )
+
+    def _noise_of_windows(self) -> tuple[Array, Array]:
+        """Return blocks (B, n), zero where not used, and the variance of one (W, n), (rad/s)^2."""
+        blocks = self.blocks
+        finite = np.isfinite(blocks.mean)
+        delivered = np.add.reduceat(finite, blocks.start, axis=0)
+        present = delivered >= PRESENT * blocks.size[:, None]
+        # Blocks (B,) with all channels that are present in their window.
+        self.used: Mask = np.asarray((finite | ~present[self.window]).all(axis=1))
+        y = np.where(finite & present[self.window], blocks.mean, 0.0)
+        self.count: Int = np.add.reduceat(self.used, blocks.start)
+        total = np.add.reduceat(y * self.used[:, None], blocks.start, axis=0)
+        mean = total / np.maximum(self.count, 1)[:, None]
+        apart = (y - mean[self.window]) * self.used[:, None]
+        free = np.maximum(self.count - 1, 1)[:, None, None]
+        covariance = self._by_window(apart, apart) / free
+        # (W, n), the second for channels with usable single samples.
+        self.present = present & (self.count >= LEAST_BLOCKS)[:, None]
+        known = np.isfinite(np.einsum("wii->wi", blocks.samples))
+        self.sampled = self.present & known & (blocks.count > 3)[:, None]
+        moment = of_the_moment(covariance, self.present, self.axes)
+        self.floor = find_floor(blocks.samples, blocks.count, self.sampled, self.axes)
+        return y, moment
+
+    def _accelerations(self) -> Array:
+        """Return angular accelerations (B, 3), rad/s^2, 0 where unknown.
+
+        Blocks in motion without one are no longer used.
+        """
+        blocks, rate = self.blocks, self.rate
+        acceleration, inside = np.zeros_like(rate), np.zeros(len(rate), dtype=bool)
         span = blocks.seconds[2:] - blocks.seconds[:-2]
         inside[1:-1] = (span < 2.5 * blocks.length) & self.used[2:] & self.used[:-2]
-        acceleration[1:-1] = (self.rate[2:] - self.rate[:-2]) / span[:, None]
+        acceleration[1:-1] = (rate[2:] - rate[:-2]) / span[:, None]
+        enough = self.count >= LEAST_BLOCKS
         self.used = self.used & (inside | self.rest[self.window]) & enough[self.window]
+        return acceleration * inside[:, None]
+
+    def _join_windows(self) -> None:
+        """Join windows to at most `MOST_STEPS` groups of a constant bias."""
+        blocks = self.blocks
         each = -(-blocks.windows // MOST_STEPS)
         self.groups = [
             slice(first, first + each) for first in range(0, blocks.windows, each)
@@ -338,12 +349,26 @@ class _Pass:
         self.middle: Array = np.array(
             [blocks.time[group].mean() for group in self.groups]
         )
-        self.times = (
-            blocks.time[0] + self.middle - self.middle[0]
-        )  # (K,) of the joined windows, s from the first
-        self.evidence, self.careful = self._find_evidence(
-            sensors, delay, y, acceleration * inside[:, None]
+        #: (K,) of the joined windows, s from the first
+        self.times = blocks.time[0] + self.middle - self.middle[0]
+
+    def solve(
+        self, walk: RandomWalk | None, careful: bool
+    ) -> tuple[Smoothed, Smoothed]:
+        """Return the constants that motion shows, and all states given these.
+
+        ``careful``: without what vibration explains.
+        """
+        usual = USUAL_WALK
+        if walk is not None:
+            usual = walk.value or min(walk.possible, USUAL_WALK)
+        shown = smooth(self.careful if careful else self.evidence, usual)
+        of_motion = slice(0, self.motion)
+        known = (
+            shown.constant[of_motion],
+            shown.constant_covariance[of_motion, of_motion],
         )
+        return shown, smooth(self.evidence, usual, known)
 
     def curve_of(self, found: Smoothed) -> Array:
         """Biases (K, n) over time, rad/s."""
@@ -403,75 +428,71 @@ class _Pass:
         self, sensors: Priors, delay: Array, y: Array, acceleration: Array
     ) -> tuple[NormalEquations, NormalEquations]:
         """Return the evidence in blocks y (B, n), complete and without vibration."""
-        blocks, axes, variance, rest, n = (
-            self.blocks,
-            self.axes,
-            self.variance,
-            self.rest,
-            len(self.axes),
-        )
+        axes, variance, n = self.axes, self.variance, len(self.axes)
         coefficients, prior = coefficients_of(sensors, axes)
-        moving = (~rest[self.window])[:, None]
-        base = (
-            np.hstack([np.ones((len(y), 1)), self.rate * moving, acceleration * moving])
-            * self.used[:, None]
+        moving = (~self.still[self.window])[:, None]
+        base = np.hstack(
+            [np.ones((len(y), 1)), self.rate * moving, acceleration * moving]
         )
+        base = base * self.used[:, None]
         # In motion A H = 0. Subtracting the rate first avoids the rounding error.
         residual = (y - (self.rate * moving) @ axes.T) * self.used[:, None]
         moments, cross = self._by_window(base, base), self._by_window(base, residual)
-        # The noise power of rate and acceleration is subtracted.
-        count = np.add.reduceat(self.used, blocks.start) * ~rest
-        noise = count[:, None, None] * np.linalg.inv(
-            np.einsum("ia,wi,ib->wab", axes, 1.0 / variance, axes)
-        )
-        moments[:, 1:4, 1:4] -= noise
-        moments[:, 4:7, 4:7] -= noise / (2.0 * blocks.length**2)
-        values, vectors = np.linalg.eigh(moments)
-        moments = np.einsum(
-            "wab,wb,wcb->wac", vectors, np.maximum(values, 0.0), vectors
-        )
+        count = np.add.reduceat(self.used, self.blocks.start) * ~self.still
+        moments = self._without_noise(moments, count)
         a = information(variance, axes)
-        a[rest] = _at_rest(variance[rest], axes)
+        a[self.still] = _at_rest(variance[self.still], axes)
+        expected = (sensors.delay - delay)[1:]
         start = np.concatenate(
-            [np.zeros(n), (sensors.axes - axes).ravel(), -delay[1:], np.zeros(n)]
+            [np.zeros(n), (sensors.axes - axes).ravel(), expected, np.zeros(n)]
         )
         prior = np.concatenate([prior, np.full(n, BIAS_RATE.prior)])
         flat = coefficients.reshape(-1, n * BASE)
 
         def summed(moments: Array, cross: Array) -> NormalEquations:
-            normal, right = (
-                np.zeros((len(self.groups), len(flat), len(flat))),
-                np.zeros((len(self.groups), len(flat))),
-            )
-            for k, group in enumerate(self.groups):
-                # (n, n, 7, 7): sum of the products of A and s s'.
-                products = a[group].reshape(-1, n * n).T @ moments[group].reshape(
-                    -1, BASE * BASE
-                )
-                products = (
-                    products.reshape(n, n, BASE, BASE)
-                    .transpose(0, 2, 1, 3)
-                    .reshape(n * BASE, n * BASE)
-                )
-                normal[k] = flat @ products @ flat.T
-                right[k] = flat @ (a[group] @ np.swapaxes(cross[group], 1, 2)).sum(
-                    axis=0
-                ).reshape(-1)
-            # A steady change is a state of its own: the bias is b + (t - mean t) g.
-            since = (self.middle - self.middle.mean())[:, None, None]
-            rates = since * normal[:, :n]
-            whole = np.block(
-                [
-                    [normal, np.swapaxes(rates, 1, 2)],
-                    [rates, since**2 * normal[:, :n, :n]],
-                ]
-            )
-            rights = np.hstack([right, since[:, 0] * right[:, :n]])
+            normal, right = self._sums(flat, a, moments, cross)
             apart = np.diff(self.middle, append=self.middle[-1])
-            return NormalEquations(n, whole, rights, apart, prior, start)
+            return NormalEquations(n, normal, right, apart, prior, start)
 
         kept = self._beyond_vibration(moments, count)
         return summed(moments, cross), summed(kept @ moments, kept @ cross)
+
+    def _without_noise(self, moments: Array, count: Int) -> Array:
+        """Return moments (W, 7, 7) without the noise power of rate and acceleration."""
+        axes = self.axes
+        of_rate = np.einsum("ia,wi,ib->wab", axes, 1.0 / self.variance, axes)
+        noise = count[:, None, None] * np.linalg.inv(of_rate)
+        moments[:, 1:4, 1:4] -= noise
+        moments[:, 4:7, 4:7] -= noise / (2.0 * self.blocks.length**2)
+        values, vectors = np.linalg.eigh(moments)
+        positive = np.maximum(values, 0.0)
+        return np.asarray(np.einsum("wab,wb,wcb->wac", vectors, positive, vectors))
+
+    def _sums(
+        self, flat: Array, a: Array, moments: Array, cross: Array
+    ) -> tuple[Array, Array]:
+        """Sum N (K, s, s) and r (K, s) over joined windows.
+
+        ``flat`` (s, 7 n): coefficients of the states, ``a`` (W, n, n): information,
+        ``moments`` (W, 7, 7) and ``cross`` (W, 7, n). The change of the biases is
+        added as states of its own: the bias is b + (t - mean t) g.
+        """
+        n, size = len(self.axes), (len(self.groups), len(flat))
+        normal, right = np.zeros((*size, len(flat))), np.zeros(size)
+        for k, group in enumerate(self.groups):
+            # (n, n, 7, 7): sum of the products of A and s s'.
+            of_windows = a[group].reshape(-1, n * n).T
+            products = of_windows @ moments[group].reshape(-1, BASE * BASE)
+            products = products.reshape(n, n, BASE, BASE).transpose(0, 2, 1, 3)
+            normal[k] = flat @ products.reshape(n * BASE, n * BASE) @ flat.T
+            weighted = (a[group] @ np.swapaxes(cross[group], 1, 2)).sum(axis=0)
+            right[k] = flat @ weighted.reshape(-1)
+        since = (self.middle - self.middle.mean())[:, None, None]
+        rates = since * normal[:, :n]
+        whole = np.block(
+            [[normal, np.swapaxes(rates, 1, 2)], [rates, since**2 * normal[:, :n, :n]]]
+        )
+        return whole, np.hstack([right, since[:, 0] * right[:, :n]])
 
     def _beyond_vibration(self, moments: Array, count: Int) -> Array:
         """Return the part (W, 7, 7) of moments M (W, 7, 7) beyond vibration: M (M + K)^-1.

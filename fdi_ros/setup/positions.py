@@ -96,7 +96,7 @@ def find_positions(
     if not kept or kept[0] != 0 or block.acceleration is None:
         return ()
     force = _forces(block.acceleration, config, found)
-    turning, noise = _turning(found)
+    turning, noise = turning_of(found)
     return tuple(
         Position(
             unit,
@@ -112,13 +112,13 @@ def _forces(block: Block, config: Config, found: StateEstimate) -> Array:
     axes = build_geometry(config).axes.reshape(-1, 3, 3)
     most = np.broadcast_to(config.accelerometers.max_acceleration, block.z.shape[1])
     data = prepare(block, most)
-    mean = make_blocks(data, _delays(config, found)).mean.reshape(-1, len(axes), 3)
+    mean = make_blocks(data, delays_of(config, found)).mean.reshape(-1, len(axes), 3)
     return np.asarray(np.einsum("uab,kub->kua", np.linalg.inv(axes), mean)) / (
         FORCE.natural
     )
 
 
-def _delays(config: Config, found: StateEstimate) -> Array:
+def delays_of(config: Config, found: StateEstimate) -> Array:
     """Delay of the stamps of every channel (3 units,), s, 0 for units not in use."""
     used = np.array(
         [
@@ -132,7 +132,7 @@ def _delays(config: Config, found: StateEstimate) -> Array:
     return np.repeat(of_units[np.arange(len(of_units)), np.abs(of_units).argmax(1)], 3)
 
 
-def _turning(found: StateEstimate) -> tuple[Array, Array]:
+def turning_of(found: StateEstimate) -> tuple[Array, Array]:
     """Return the matrices (B, 3, 3) that positions are multiplied by, 1/s^2, NaN if unknown.
 
     Also the covariance (W, 3, 3) of the noise of the angular acceleration.

@@ -40,7 +40,8 @@ from fdi_ros.report.layout import (
 )
 from fdi_ros.setup.agreement import SHOWN
 from fdi_ros.setup.blocks import flag_runs
-from fdi_ros.setup.calibrate import UNMEASURED, Calibration, StampDelay
+from fdi_ros.setup.calibrate import Calibration, StampDelay
+from fdi_ros.setup.channels import UNMEASURED
 from fdi_ros.setup.estimate import SHOWN_DELAY
 from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.positions import SHOWN_POSITION

@@ -1,0 +1,294 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Noise, biases, scales and misalignments of accelerometers against each other.
+
+The estimate is that of the gyros (`fdi_ros.setup.estimate`) on specific forces over
+`FORCE.natural`, less what the turning of the body adds at known positions. Accelerometers
+are never at rest in its sense: gravity turns with the attitude, and rest, as the gyros
+show it, means a constant specific force. Rest in several attitudes and motion tell scale
+errors from biases. Errors that all accelerometers have in common stay at zero, because no
+accelerometer contradicts them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fdi_ros.config.config import Config
+from fdi_ros.config.settings import LEAST_NOISE
+from fdi_ros.errors import CalibrationError, DisagreementError
+from fdi_ros.model.quantity import FORCE
+from fdi_ros.model.samples import Array, Block, Int, Mask
+from fdi_ros.monitor.accelerometers import (
+    accelerometer_names,
+    felt_units,
+    lever_arms,
+)
+from fdi_ros.monitor.building import UNIT_DELAY, build_geometry
+from fdi_ros.setup.agreement import LEAST_RESPONSE
+from fdi_ros.setup.blocks import Data, prepare, resampled, spikes
+from fdi_ros.setup.channels import ChannelFit
+from fdi_ros.setup.estimate import (
+    REFERENCE_STD,
+    SCALE_STD,
+    Priors,
+    StateEstimate,
+    estimate,
+)
+from fdi_ros.setup.noise import projector
+from fdi_ros.setup.positions import delays_of, turning_of
+
+#: share of its samples that an accelerometer must give
+LEAST_USABLE = 0.3
+#: largest angle between the specific forces of two units, rad: swapped or reversed axes
+#: make more
+LARGEST_TURN = float(np.radians(30.0))
+#: median specific force of accelerometers that measure in g
+IN_G = (0.8, 1.2)
+#: largest ratio of the noise in motion to noise_std, as for gyros
+LOUDER = 4.0
+
+
+@dataclass
+class AccelerometerFit(ChannelFit):
+    """What a recording shows of the accelerometers, in m/s^2.
+
+    `estimate` holds the differences from what all have in common.
+    """
+
+    #: parameters to be changed, ``{"section.field": value}``
+    settings: dict[str, object]
+    #: what the monitor declares of them in this recording
+    faults: tuple[Any, ...] = ()
+
+
+@dataclass
+class Prepared:
+    """The accelerometers of a recording, ready for the estimate."""
+
+    names: tuple[str, ...]
+    #: (n,) numbers of the channels in use among those of all units of the config
+    active: Int
+    #: (N, n) over `FORCE.natural`, less what the turning of the body adds
+    data: Data
+    priors: Priors
+    #: (N, n) samples left out as spikes
+    spiky: Mask
+
+    def as_monitored(self, stamp: Int, width: int) -> Block:
+        """Return the forces (N, width) as a monitor has them with delays taken off, m/s^2."""
+        delay = self.priors.delay[self.priors.unit]
+        z = np.full((len(stamp), width), np.nan)
+        z[:, self.active] = resampled(self.data, delay)[0] * FORCE.natural
+        return Block(stamp, z, np.isfinite(z))
+
+
+def prepare_accelerometers(
+    block: Block, config: Config, gyros: StateEstimate, trusted: Sequence[str] = ()
+) -> Prepared | None:
+    """Prepare the accelerometers of a recording whose gyros are calibrated.
+
+    ``config``: with calibrated axes of the gyros, and with the positions.
+    ``trusted``: names of units that are taken as configured. None without
+    accelerometers of two units. `CalibrationError` if they give too few values, or
+    contradict each other.
+    """
+    units = felt_units(block) if config.has_units else ()
+    if len(units) < 2 or block.acceleration is None:
+        return None
+    everywhere = range(len(config.topics))
+    whole, felt = (accelerometer_names(config, which) for which in (everywhere, units))
+    names = tuple(name for name in felt if name not in config.excluded_channels)
+    active = np.array([whole.index(name) for name in names])
+    axes, force = nominal_axes(config)[active], block.acceleration
+    most = np.broadcast_to(config.accelerometers.max_acceleration, len(whole))[active]
+    delivered = force.delivered[:, active]
+    data = prepare(Block(force.stamp, force.z[:, active], delivered), most)
+    _check_amount(data, names)
+    numbers, first, of = np.unique(active // 3, return_index=True, return_inverse=True)
+    _check_forces(data.z, [config.imu_names[k] for k in numbers], of, axes)
+    delay = delays_of(config, gyros)[active]
+    arms = lever_arms(config, everywhere)[active]
+    data.z = (data.z - _added(data, gyros, axes, arms, delay)) / FORCE.natural
+    spiky = spikes(data.z, axes)
+    data.z[spiky] = np.nan
+    known = [name.rpartition(".")[0] in trusted for name in names]
+    priors = Priors(
+        axes=axes,
+        unit=of,
+        units=len(numbers),
+        scale_std=np.where(known, REFERENCE_STD, SCALE_STD),
+        bias_std=max(config.accelerometers.turn_on_std / FORCE.natural, 1e-6),
+        delay_std=UNIT_DELAY,
+        delay=delay[first],
+        rest=gyros.rest,
+    )
+    return Prepared(names, active, data, priors, spiky)
+
+
+def nominal_axes(config: Config) -> Array:
+    """Return the axes (3 units, 3) of all accelerometers, as configured.
+
+    Without such settings, those of the gyros, as the nearest right angles: scale factors
+    and misalignments of gyros are not those of accelerometers.
+    """
+    if config.accelerometers.axes:
+        return np.reshape(config.accelerometers.axes, (-1, 3))
+    u, _, v = np.linalg.svd(build_geometry(config).axes.reshape(-1, 3, 3))
+    return np.asarray((u @ v).reshape(-1, 3))
+
+
+def _added(
+    data: Data, gyros: StateEstimate, axes: Array, arms: Array, delay: Array
+) -> Array:
+    """Return what the turning of the body adds to each value (N, n), m/s^2."""
+    added = np.zeros_like(data.z)
+    if not arms.any():
+        return added
+    turning, seconds = np.nan_to_num(turning_of(gyros)[0]), gyros.blocks.seconds
+    along = np.einsum("bac,nc,na->bn", turning, arms, axes)
+    for i, values in enumerate(along.T):
+        added[:, i] = np.interp(data.seconds - delay[i], seconds, values)
+    return added
+
+
+def _check_amount(data: Data, names: Sequence[str]) -> None:
+    share = np.isfinite(data.z).mean(axis=0)
+    if len(names) < 4:
+        raise CalibrationError(
+            f"{len(names)} accelerometers are in use, expected at least 4"
+        )
+    usual = float(np.median(share))
+    if (least := float(share.min())) < LEAST_USABLE * max(usual, LEAST_USABLE):
+        raise CalibrationError(
+            f"{names[int(share.argmin())]} gives a usable value in {least:.0%} of the samples"
+        )
+
+
+def _check_forces(z: Array, units: Sequence[str], unit: Int, axes: Array) -> None:
+    """Refuse units that do not measure one specific force: other units, or other axes.
+
+    ``z`` (N, n), m/s^2, of channels in units (n,) with nominal axes (n, 3).
+    """
+    whole = [k for k in range(len(units)) if (unit == k).sum() == 3]
+    rows = z[np.isfinite(z).all(axis=1)]
+    if len(whole) < 2 or len(rows) < 1:
+        return
+    columns = [unit == k for k in whole]
+    forces = np.array([rows[:, one] @ np.linalg.inv(axes[one]).T for one in columns])
+    sizes = np.linalg.norm(forces, axis=2)
+    size = np.median(sizes, axis=1)
+    others = np.array([np.median(np.delete(size, k)) for k in range(len(size))])
+    ratio = size / np.maximum(others, 1e-9)
+    odd = int(np.abs(np.log(np.maximum(ratio, 1e-9))).argmax())
+    name = units[whole[odd]]
+    if not LEAST_RESPONSE < ratio[odd] < 1.0 / LEAST_RESPONSE:
+        raise DisagreementError(
+            f"the accelerometers of {name} measure {ratio[odd]:.3g} times the specific force of the others: look"
+            " at its unit (m/s^2), or name them in excluded_channels"
+        )
+    if IN_G[0] < np.median(size) < IN_G[1]:
+        raise CalibrationError(
+            f"the accelerometers measure {np.median(size):.3g} m/s^2 in the median, expected about 9.8: they are in g"
+        )
+    directions = forces / np.maximum(sizes, 1e-9)[:, :, None]
+    cosine = np.median(np.einsum("jna,kna->jkn", directions, directions), axis=2)
+    mean = (cosine.sum(axis=1) - 1.0) / (len(whole) - 1)
+    odd = int(mean.argmin())
+    angle = float(np.arccos(np.clip(np.max(np.delete(cosine[odd], odd)), -1.0, 1.0)))
+    if angle > LARGEST_TURN:
+        raise DisagreementError(
+            f"the accelerometers of {units[whole[odd]]} measure a specific force {np.degrees(angle):.0f} deg from"
+            " that of the others, with the mount of their gyros: its axes are swapped or reversed in the driver"
+        )
+
+
+def fit_accelerometers(
+    ready: Prepared,
+    config: Config,
+    without: Callable[[Data, tuple[str, ...]], Data] = lambda data, names: data,
+    faults: tuple[Any, ...] = (),
+) -> AccelerometerFit:
+    """Estimate noise, biases, axes of the accelerometers.
+
+    ``without`` leaves out the samples of the ``faults``, which were declared.
+    """
+    data, names = without(ready.data, ready.names), ready.names
+    found = estimate(data, ready.priors)
+    return AccelerometerFit(
+        names=names,
+        nominal=ready.priors.axes,
+        estimate=_differences(_scaled(found), ready.priors.axes),
+        unusable=data.unusable | {"spikes": np.asarray(ready.spiky.sum(axis=0))},
+        settings=_settings(config, ready.active, found),
+        faults=faults,
+    )
+
+
+def _scaled(found: StateEstimate) -> StateEstimate:
+    """Return the estimate in m/s^2."""
+    size, floor, walk = FORCE.natural, found.floor, found.bias_walk
+    return replace(
+        found,
+        bias=found.bias * size,
+        bias_covariance=found.bias_covariance * size**2,
+        curve=found.curve * size,
+        bias_walk=walk._replace(value=walk.value * size, possible=walk.possible * size),
+        floor=replace(floor, std=floor.std * size, error=floor.error * size),
+        moment=found.moment * size,
+        rate=found.rate * size,
+    )
+
+
+def _differences(found: StateEstimate, nominal: Array) -> StateEstimate:
+    """Return biases and axes without what all channels have in common.
+
+    That common part is a specific force to the accelerometers, or a turn and scale of
+    the body frame: no channel contradicts them.
+    """
+    apart = projector(found.axes)
+    of_axes = np.kron(apart, np.eye(3))
+    return replace(
+        found,
+        axes=nominal + apart @ (found.axes - nominal),
+        axes_covariance=of_axes @ found.axes_covariance @ of_axes,
+        bias=apart @ found.bias,
+        bias_covariance=apart @ found.bias_covariance @ apart,
+        curve=found.curve @ apart,
+    )
+
+
+def _settings(config: Config, active: Int, found: StateEstimate) -> dict[str, object]:
+    """Return the changed parameters."""
+    own, n = config.accelerometers, 3 * len(config.topics)
+
+    def changed(before: Sequence[float], new: Array | float) -> list[float]:
+        """Replace the values of the channels in use, and give them back with 4 digits."""
+        values = np.array(np.broadcast_to(before, n), dtype=float)
+        values[active] = new
+        return [float(f"{value:.4g}") + 0.0 for value in values]
+
+    std, moving = found.floor.std, found.moment[~found.rest]
+    if len(moving):
+        std = np.maximum(std, np.median(moving, axis=0) / LOUDER)
+    axes = nominal_axes(config)
+    axes[active] = found.axes
+    scale = found.disagreement()[0]
+    settings: dict[str, object] = {
+        "accelerometers.noise_std": changed(
+            own.noise_std, np.maximum(std, LEAST_NOISE) * FORCE.natural
+        ),
+        "accelerometers.scale_std": changed(own.scale_std, scale),
+        "accelerometers.bias": changed(own.bias or (0.0,), found.bias * FORCE.natural),
+        "accelerometers.axes": [round(float(v), 6) + 0.0 for v in axes.ravel()],
+    }
+    walk = found.bias_walk.value * FORCE.natural
+    # A bench shows less than a flight, where vibration moves the biases.
+    if walk > max(own.bias_walk):
+        settings["accelerometers.bias_walk"] = changed(own.bias_walk, walk)
+    return settings
