@@ -90,7 +90,8 @@ WHEN = {
     "accelerometers.turn_on_std": "They are calibrated, or from the works.",
     "accelerometers.max_drift": "You know what a healthy bias may do.",
     "accelerometers.max_acceleration": "Their range is another one.",
-    "accelerometers.axes": "The accelerometers of an array point elsewhere than its gyros.",
+    "accelerometers.bias": "`fdi setup` or `fdi calibrate` has measured it.",
+    "accelerometers.axes": "They point elsewhere than the gyros, or `fdi setup` has measured it.",
     "accelerometers.position_std": "Positions are known better, or worse, than that.",
     "accelerometers.positions": "The units are more than a few centimetres apart.",
 }

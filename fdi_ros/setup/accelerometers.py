@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_ros.config.config import Config
-from fdi_ros.config.settings import LEAST_NOISE
+from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.errors import CalibrationError, DisagreementError
 from fdi_ros.model.quantity import FORCE
 from fdi_ros.model.samples import Array, Block, Int, Mask
@@ -52,6 +51,11 @@ LARGEST_TURN = float(np.radians(30.0))
 IN_G = (0.8, 1.2)
 #: largest ratio of the noise in motion to noise_std, as for gyros
 LOUDER = 4.0
+#: smallest noise_std written, m/s^2: a bench shows less than a flight, and motion of
+#: units that are not sampled at one instant looks like noise
+LEAST_NOISE_STD = float(PARAMETERS["accelerometers.noise_std"].default[0])
+#: smallest scale_std written: nonlinearity of consumer accelerometers
+LEAST_SCALE_STD = 0.002
 
 
 @dataclass
@@ -278,10 +282,10 @@ def _settings(config: Config, active: Int, found: StateEstimate) -> dict[str, ob
         std = np.maximum(std, np.median(moving, axis=0) / LOUDER)
     axes = nominal_axes(config)
     axes[active] = found.axes
-    scale = found.disagreement()[0]
+    scale = max(found.disagreement()[0], LEAST_SCALE_STD)
     settings: dict[str, object] = {
         "accelerometers.noise_std": changed(
-            own.noise_std, np.maximum(std, LEAST_NOISE) * FORCE.natural
+            own.noise_std, np.maximum(std * FORCE.natural, LEAST_NOISE_STD)
         ),
         "accelerometers.scale_std": changed(own.scale_std, scale),
         "accelerometers.bias": changed(own.bias or (0.0,), found.bias * FORCE.natural),

@@ -253,7 +253,10 @@ class _Beside:
         names = build_geometry(config).channel_names
         self.names = tuple(names[i] for i in active)
         try:
-            self.ready = prepare_accelerometers(block, self.config, gyros, trusted)
+            # The best estimate, even of a position that is not known well enough to be written.
+            likely = position_settings(self.positions, config, likely=True)
+            placed = self.config.replaced(likely)
+            self.ready = prepare_accelerometers(block, placed, gyros, trusted)
             if self.ready is not None:
                 of_faults = partial(_without, faults)
                 self.fit = fit_accelerometers(

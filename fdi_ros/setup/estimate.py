@@ -37,6 +37,7 @@ from fdi_ros.estimator.error_states import (
 from fdi_ros.estimator.estimator import LONG_TIME, REST_BLOCKS
 from fdi_ros.estimator.rest import QUIET, REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.shared_noise import UNEQUAL
+from fdi_ros.model.geometry import spans_space
 from fdi_ros.model.samples import Array, Int, Mask
 from fdi_ros.monitor.building import UNIT_DELAY
 from fdi_ros.setup.blocks import PRESENT, Blocks, Data, make_blocks
@@ -308,8 +309,12 @@ class _Pass:
         finite = np.isfinite(blocks.mean)
         delivered = np.add.reduceat(finite, blocks.start, axis=0)
         present = delivered >= PRESENT * blocks.size[:, None]
+        # Channels that do not span space give no rate.
+        present &= spanning(present, self.axes)[:, None]
         # Blocks (B,) with all channels that are present in their window.
-        self.used: Mask = np.asarray((finite | ~present[self.window]).all(axis=1))
+        complete = (finite | ~present[self.window]).all(axis=1)
+        known: Mask = np.asarray(present.any(axis=1))
+        self.used: Mask = np.asarray(complete & known[self.window])
         y = np.where(finite & present[self.window], blocks.mean, 0.0)
         self.count: Int = np.add.reduceat(self.used, blocks.start)
         total = np.add.reduceat(y * self.used[:, None], blocks.start, axis=0)
@@ -319,8 +324,8 @@ class _Pass:
         covariance = self._by_window(apart, apart) / free
         # (W, n), the second for channels with usable single samples.
         self.present = present & (self.count >= LEAST_BLOCKS)[:, None]
-        known = np.isfinite(np.einsum("wii->wi", blocks.samples))
-        self.sampled = self.present & known & (blocks.count > 3)[:, None]
+        usable = np.isfinite(np.einsum("wii->wi", blocks.samples))
+        self.sampled = self.present & usable & (blocks.count > 3)[:, None]
         moment = of_the_moment(covariance, self.present, self.axes)
         self.floor = find_floor(blocks.samples, blocks.count, self.sampled, self.axes)
         return y, moment
@@ -560,6 +565,15 @@ class _Pass:
             short, long = (part.var(axis=1, ddof=1).sum(axis=0) for part in (t, means))
             found[regime] = np.maximum(SUBS * long / np.maximum(short, 1e-30), 1.0)
         return found
+
+
+def spanning(present: Mask, axes: Array) -> Mask:
+    """Return the windows (W,) whose channels, present (W, n), span three dimensions."""
+    found = np.zeros(len(present), dtype=bool)
+    patterns, which = np.unique(present, axis=0, return_inverse=True)
+    for k, pattern in enumerate(patterns):
+        found[which.ravel() == k] = spans_space(axes[pattern])
+    return found
 
 
 def _at_rest(variance: Array, axes: Array) -> Array:

@@ -16,7 +16,7 @@ an axis that no turn shows stay at their prior, with its error.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,9 +25,11 @@ from fdi_ros.inspection.turns import SQUARE
 from fdi_ros.model.quantity import FORCE
 from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.monitor.accelerometers import (
+    UNKNOWN_POSITION,
     accelerometer_names,
     felt_units,
     lever_arms,
+    position_variance,
 )
 from fdi_ros.monitor.building import UNIT_DELAY, build_geometry
 from fdi_ros.setup.blocks import make_blocks, prepare
@@ -252,17 +254,26 @@ def _position(
 
 
 def position_settings(
-    positions: tuple[Position, ...], config: Config
-) -> dict[str, object]:
-    """Return the changed parameters: what is measured, the rest as configured."""
-    if not any(one.measured.any() for one in positions):
+    positions: tuple[Position, ...], config: Config, likely: bool = False
+) -> dict[str, Any]:
+    """Return the changed parameters: what is measured, the rest as configured.
+
+    ``likely``: the estimates, measured or not.
+    """
+    if not likely and not any(one.measured.any() for one in positions):
         return {}
     units = range(len(config.topics))
     known = lever_arms(config, units)[::3].copy()
     for one in positions:
-        known[one.unit] = np.where(one.measured, one.value, known[one.unit])
-    return {
-        "accelerometers.positions": [
-            round(float(value), 4) + 0.0 for value in known.ravel()
-        ]
-    }
+        taken = np.logical_or(one.measured, likely)
+        known[one.unit] = np.where(taken, one.value, known[one.unit])
+    before = np.sqrt(position_variance(config, units))[::3]
+    unknown = np.where(before > 0.0, before, UNKNOWN_POSITION)
+    unknown[0] = 0.0
+    for one in positions:
+        errors = np.where(one.measured, one.error, unknown[one.unit])
+        unknown[one.unit] = errors.max()
+    places = [round(float(value), 4) + 0.0 for value in known.ravel()]
+    std = [float(f"{value:.2g}") for value in unknown]
+    both = {"accelerometers.positions": places, "accelerometers.position_std": std}
+    return both if positions else {}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array
 from fdi_ros.replay.sweep_report import declared_figures
 from fdi_ros.report.layout import (
+    FORCES,
     RADIANS,
     Column,
     Section,
@@ -38,10 +40,11 @@ from fdi_ros.report.layout import (
     time_layout,
     told,
 )
+from fdi_ros.setup.accelerometers import AccelerometerFit
 from fdi_ros.setup.agreement import SHOWN
 from fdi_ros.setup.blocks import flag_runs
-from fdi_ros.setup.calibrate import Calibration, StampDelay
-from fdi_ros.setup.channels import UNMEASURED
+from fdi_ros.setup.calibrate import Calibration, Span, StampDelay
+from fdi_ros.setup.channels import UNMEASURED, ChannelFit
 from fdi_ros.setup.estimate import SHOWN_DELAY
 from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.positions import SHOWN_POSITION
@@ -63,6 +66,8 @@ LARGE_SWING, LARGE_BIAS = (
     float(np.radians(0.03)),
     0.2,
 )
+#: of the bias of an accelerometer against the others, m/s^2
+LARGE_FORCE = 1.0
 #: share of the samples that are missing or spikes, which is worth a look
 MANY = 0.01
 #: size of test faults, rad/s, and the share to be found
@@ -74,6 +79,10 @@ NOISE_HINT = (
     "Standard deviation of one sample, over windows of 10 s, vibration included. noise_std (marked at the left) is the"
     " level of the quietest windows; the monitor measures in flight what vibration adds."
 )
+FORCE_HINT = (
+    "Differences from what all accelerometers have in common, which is not seen; with standard errors (+-). The axes"
+    " of the gyros, at right angles, are nominal."
+)
 BIAS_HINT = "Estimate over the recording, minus the mean of each channel. The common part is observable only at rest."
 
 
@@ -82,6 +91,7 @@ def calibration_findings(
 ) -> Iterator[Finding]:
     """Yield results, unknown quantities and warnings."""
     yield from _found(result, unit)
+    yield from _accelerometers(result)
     yield from _positions(result)
     yield from _unknown(result, body_frame, unit)
     yield from _warnings(result, unit)
@@ -235,34 +245,129 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
         yield Finding(Role.UNKNOWN, "delay", words, names, None, worst, SHOWN_DELAY)
 
 
+def _accelerometers(result: Calibration) -> Iterator[Finding]:
+    """Yield what is found of the accelerometers, and what is not."""
+    if result.accelerometers is not None:
+        yield from _found_forces(result.accelerometers)
+        yield from _unknown_forces(result.accelerometers)
+        yield from _force_warnings(result.accelerometers)
+    elif result.refused:
+        words = f"accelerometers: not calibrated: {result.refused}"
+        yield Finding(Role.UNKNOWN, "accelerometers", words)
+
+
+def _found_forces(fit: AccelerometerFit) -> Iterator[Finding]:
+    """Yield noise, biases and scale error of the accelerometers."""
+    found, name = fit.estimate, FORCES.name
+    low, high = found.floor.std.min(), found.floor.std.max()
+    usual = np.median(found.moment, axis=0)
+    words = f"accelerometers: noise {low:.2g} to {high:.2g} {name}, in the quietest"
+    words += f" {found.floor.share:.0%} of the recording; median with vibration"
+    words += f" {usual.min():.2g} to {usual.max():.2g}"
+    largest = int(found.floor.std.argmax())
+    noise, error = found.floor.std[largest], found.floor.error[largest]
+    yield Finding(
+        Role.FOUND, "accelerometer noise", words, (), float(noise), float(error)
+    )
+    shown = np.abs(found.bias) > fit.bias_std
+    words = f"accelerometers: biases against each other: {shown.sum()} of {len(shown)}"
+    words += " are larger than their errors"
+    if shown.any():
+        largest = int(np.where(shown, np.abs(found.bias), 0.0).argmax())
+        value, error = float(found.bias[largest]), float(fit.bias_std[largest])
+        words += (
+            f", the largest {fit.names[largest]} {value:+.3f} +- {error:.3f} {name}"
+        )
+    yield Finding(Role.FOUND, "accelerometer bias", words)
+    words = f"accelerometers: scale error {fit.scale[0]:.2g} +- {fit.scale[1]:.1g}"
+    words += " left between them"
+    yield Finding(Role.FOUND, "accelerometer scale error", words, (), *fit.scale)
+
+
+def _unknown_forces(fit: AccelerometerFit) -> Iterator[Finding]:
+    """Yield what the recording does not show of the accelerometers."""
+    error = fit.axis_errors
+    if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:
+        words = f"accelerometers: scale factors and misalignments along {' and '.join(unmeasured)}: not"
+        words += " measured (gravity keeps its direction, or vibration hides it); a bias there may be a scale"
+        words += " error. Lay the vehicle on each of its six sides for some seconds"
+        yield Finding(
+            Role.UNKNOWN,
+            "accelerometer scale factors",
+            words,
+            unmeasured,
+            None,
+            float(error.max()),
+            UNMEASURED,
+        )
+    words = "accelerometers: a bias, scale error or misalignment that all have in common is not seen: none"
+    words += " contradicts it"
+    yield Finding(Role.UNKNOWN, "common accelerometer error", words)
+
+
+def _force_warnings(fit: AccelerometerFit) -> Iterator[Finding]:
+    """Yield declarations, unequal noise and large biases of the accelerometers."""
+    found, name = fit.estimate, FORCES.name
+    if fit.faults:
+        yield _declared(fit.faults, fit.names)
+    if noisy := much_noisier(found.floor.std, fit.units):
+        words = noisier_words(fit.names, found.floor.std, fit.units, name, 1.0)
+        who = [fit.names[i] for i, _ in noisy]
+        yield Finding(
+            Role.WARNING, "accelerometer noise", f"{words} when quietest", who
+        )
+    if len(large := np.flatnonzero(np.abs(found.bias) > LARGE_FORCE)):
+        each = ", ".join(
+            f"{fit.names[i]} by {found.bias[i]:+.2f} {name}" for i in large
+        )
+        yield Finding(
+            Role.WARNING,
+            "large accelerometer biases",
+            f"accelerometers off against the others: {each}",
+            [fit.names[i] for i in large],
+            float(np.abs(found.bias).max()),
+            None,
+            LARGE_FORCE,
+        )
+
+
+def _declared(faults: Sequence[Span], names: Sequence[str]) -> Finding:
+    """Return the finding for what the monitor declares in the part used for fitting."""
+    spans = [
+        f"{' or '.join(names[i] for i in who)} from {a:.1f} s to {b:.1f} s"
+        for who, a, b in faults
+    ]
+    words = (
+        f"the monitor declares a fault in this recording: {first_of(spans, 3, '; ')}"
+    )
+    struck = sorted({i for span in faults for i in span.channels})
+    return Finding(
+        Role.WARNING,
+        "declared",
+        words,
+        [names[i] for i in struck],
+        headline="USABLE, BUT LOOK",
+    )
+
+
+class _Bound(NamedTuple):
+    """Values of channels, and the bound beyond which they are worth a look."""
+
+    what: str
+    values: Array
+    bound: float
+    form: str  #: of one value, after multiplication by `factor`
+    factor: float
+
+
 def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
     """Yield warnings: faults, lost values, and channels beyond a bound."""
     found, names = result.estimate, result.names
     if result.faults:
-        spans = [
-            f"{' or '.join(names[i] for i in who)} from {a:.1f} s to {b:.1f} s"
-            for who, a, b in result.faults
-        ]
-        words = f"the monitor declares a fault in this recording: {first_of(spans, 3, '; ')}"
-        struck = sorted({i for span in result.faults for i in span.channels})
-        yield Finding(
-            Role.WARNING,
-            "declared",
-            words,
-            [names[i] for i in struck],
-            headline="USABLE, BUT LOOK",
-        )
-    lost = [
-        f"{int(count.sum())} {'frozen' if why == 'repeated' else why.replace('_', ' ')}"
-        f" ({'every channel' if count.all() else ', '.join(names[i] for i in np.flatnonzero(count))})"
-        for why, count in result.unusable.items()
-        if count.max()
-        > (MANY * found.blocks.count.sum() if why in ("missing", "spikes") else 0)
-    ]
-    if lost:
-        yield Finding(
-            Role.WARNING, "values not used", f"values not used: {'; '.join(lost)}"
-        )
+        yield _declared(result.faults, names)
+    if lost := _lost_words(result):
+        words = f"values not used: {'; '.join(lost)}"
+        yield Finding(Role.WARNING, "values not used", words)
     noise = found.floor.std
     if noisy := much_noisier(noise, result.units):
         words = noisier_words(names, noise, result.units, unit.name, unit.factor)
@@ -272,37 +377,64 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
         yield Finding(
             Role.WARNING, "noise", words, who, float(noise[worst]), None, beside
         )
-    rate, swing = f"{{:.3g}} {unit.name}", np.ptp(found.curve, axis=0)
-    for what, values, bound, form, factor in (
-        (
+    for one in _bounds(result, unit):
+        beyond = np.flatnonzero(np.abs(one.values) > one.bound)
+        if not len(beyond):
+            continue
+        each = [
+            f"{names[i]} by {one.form.format(one.values[i] * one.factor)}"
+            for i in beyond
+        ]
+        yield Finding(
+            Role.WARNING,
+            one.what,
+            f"{one.what}: {', '.join(each)}",
+            [names[i] for i in beyond],
+            float(one.values[np.abs(one.values).argmax()]),
+            None,
+            one.bound,
+        )
+
+
+def _lost_words(result: Calibration) -> list[str]:
+    """Words for values that were not used, by the reason."""
+    found, words = result.estimate, []
+    for why, count in result.unusable.items():
+        usual = why in ("missing", "spikes")
+        if count.max() <= (MANY * found.blocks.count.sum() if usual else 0):
+            continue
+        called = "frozen" if why == "repeated" else why.replace("_", " ")
+        which = ", ".join(result.names[i] for i in np.flatnonzero(count))
+        who = "every channel" if count.all() else which
+        words.append(f"{int(count.sum())} {called} ({who})")
+    return words
+
+
+def _bounds(result: Calibration, unit: Unit) -> list[_Bound]:
+    """Return the figures of gyros that are worth a look beyond a bound."""
+    found, rate = result.estimate, f"{{:.3g}} {unit.name}"
+    swing = np.ptp(found.curve, axis=0)
+    degrees = float(np.degrees(1.0))
+    return [
+        _Bound(
             "axes rotated from nominal",
             result.angle,
             LARGE_ANGLE,
             "{:.1f} deg",
-            np.degrees(1.0),
+            degrees,
         ),
-        (
+        _Bound(
             "scale factors differ from nominal",
             result.factor - 1.0,
             LARGE_SCALE,
             "{:+.1%}",
             1.0,
         ),
-        ("biases moved within the recording", swing, LARGE_SWING, rate, unit.factor),
-        ("large biases", found.bias, LARGE_BIAS, rate, unit.factor),
-    ):
-        if len(beyond := np.flatnonzero(np.abs(values) > bound)):
-            words = f"{what}: {', '.join(f'{names[i]} by {form.format(values[i] * factor)}' for i in beyond)}"
-            largest = float(values[np.abs(values).argmax()])
-            yield Finding(
-                Role.WARNING,
-                what,
-                words,
-                [names[i] for i in beyond],
-                largest,
-                None,
-                bound,
-            )
+        _Bound(
+            "biases moved within the recording", swing, LARGE_SWING, rate, unit.factor
+        ),
+        _Bound("large biases", found.bias, LARGE_BIAS, rate, unit.factor),
+    ]
 
 
 def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding]:
@@ -497,7 +629,24 @@ def calibration_figures(result: Calibration) -> dict[str, object]:
             }
             for span in result.faults
         ],
+        **_accelerometer_figures(result),
         "settings": result.settings,
+    }
+
+
+def _accelerometer_figures(result: Calibration) -> dict[str, object]:
+    """Return the figures of the accelerometers, in m/s^2; empty without any."""
+    fit = result.accelerometers
+    if fit is None:
+        return {}
+    return {
+        "accelerometers": {
+            "channels": figures_of(channel_columns(fit, FORCES)),
+            "share_of_recording": fit.estimate.floor.share,
+            "scale_std": fit.scale[0],
+            "scale_std_error": fit.scale[1],
+            "bias_walk": fit.estimate.bias_walk.value or None,
+        }
     }
 
 
@@ -509,7 +658,7 @@ def _beyond_error(values: Array, errors: Array, factor: float, form: str) -> lis
     ]
 
 
-def channel_columns(result: Calibration, unit: Unit = RADIANS) -> list[Column]:
+def channel_columns(result: ChannelFit, unit: Unit = RADIANS) -> list[Column]:
     """Figures of every channel, one row each."""
     found, rate, degrees = result.estimate, unit.factor, float(np.degrees(1.0))
 
@@ -674,6 +823,9 @@ def _sections(
         sections.insert(
             0, Section("Axes, biases and noise", "With standard errors (+-).", channels)
         )
+        if (fit := result.accelerometers) is not None:
+            rows = told(channel_columns(fit, FORCES), FORCES)
+            sections.insert(1, Section("Accelerometers", FORCE_HINT, rows))
     return [shown(first.words, LINE), *lines_of(findings, Role.FOUND)], sections
 
 

@@ -225,6 +225,11 @@ class SetupResult(LearnedSettings):
             "noise.bias_walk": "measured",
             "bias.fixed": "in this recording",
             "bias.turn_on_std": "not shown by one recording",
+            "accelerometers.noise_std": "measured, but at least the default",
+            "accelerometers.scale_std": "measured, but at least 0.2 %",
+            "accelerometers.bias": "in this recording, against each other",
+            "accelerometers.axes": "measured against each other",
+            "accelerometers.positions": "measured, relative to the first unit",
             "health.max_rate": "NOT KNOWN: put in the range of the data sheet",
         }
         if not source_of(self.config).units and not calibrated:

@@ -26,6 +26,9 @@ def test_positions_are_within_their_errors(kind):
     config = one.config.replaced(result.settings)
     written = np.reshape(config.accelerometers.positions, (3, 3))
     np.testing.assert_allclose(written, arms, atol=0.005)
+    std = config.accelerometers.position_std
+    assert std[0] == 0.0
+    assert 1e-5 < min(std[1:]) <= max(std[1:]) < 0.003
 
 
 @pytest.mark.parametrize("noise", [0.005, 0.05])
