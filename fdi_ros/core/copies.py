@@ -1,12 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Units that are one sensor.
+"""Units that deliver the values of one sensor twice.
 
-Two gyros differ by their noise. Where a linear map of three channels explains to
-rounding what three others change by, from sample to sample, these are a copy, perhaps
-turned, scaled or some samples later: a topic that was mapped twice. A copy agrees with
-its original whatever is wrong with it, so it is left out.
+Two gyros differ by their noise. If a linear map of three channels explains the changes of
+three others from sample to sample, except for rounding, these are a copy, possibly rotated,
+scaled or delayed by some samples. An example is a topic that was mapped twice. A copy
+agrees with its original whatever the fault, so it is left out.
 """
 
 from __future__ import annotations
@@ -21,16 +21,18 @@ from fdi_ros.core.records import RESTAMP_SAMPLES, Copies, DelayBuffer, PathSetti
 from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import MAX_RATE, Array
 
-# from one comparison to the next, ns: a copy is found on the ground, and in no hurry
+#: Time between comparisons, ns. Copies are found on the ground.
 PERIOD = 1_000_000_000
-ROWS = 24  # changes compared: fewer quantised values of two gyros at rest may agree by chance
-FEW = ROWS // 3  # compared first, as they usually exclude a copy
-# samples by which a copy may come later: a second topic of one driver is not held up
-# for longer
+#: Changes compared. Fewer quantised values of two gyros at rest may agree by chance.
+ROWS = 24
+#: Changes compared first, which usually exclude a copy.
+FEW = ROWS // 3
+#: Largest delay of a copy, samples.
 MAX_LAG = 20
-HITS = 2  # comparisons that make a copy: one alone may be of values that hardly change
-# of what the noise makes: smaller changes are smooth, and what explains them may be the
-# motion
+#: Comparisons that show a copy. A single one may be of values that hardly change.
+HITS = 2
+#: Smallest changes, as a share of the noise. Smaller changes are smooth, and motion may
+#: explain them.
 LEAST_NOISE = 0.02
 
 
@@ -38,7 +40,7 @@ LEAST_NOISE = 0.02
 def update_copies(
     copies: Copies, settings: PathSettings, line: DelayBuffer, stamp: int
 ) -> None:
-    """Compare all pairs of units, once in `PERIOD`; ``copies.found``: a new copy was found."""
+    """Compare all pairs of units once in `PERIOD`. ``copies.found`` is set for a new copy."""
     if stamp - copies.stamp < PERIOD or line.count < ROWS + 3:
         return
     copies.stamp = stamp
@@ -61,7 +63,7 @@ def update_copies(
 def is_copy(
     copies: Copies, settings: PathSettings, line: DelayBuffer, a: int, b: int
 ) -> bool:
-    """Whether one of two units gives what the other gives, or gave some samples ago."""
+    """Return whether one of two units delivers present or earlier values of the other."""
     first, second = (
         first_of_three(settings.members[a]),
         first_of_three(settings.members[b]),
@@ -84,7 +86,7 @@ def is_copy(
 
 @compiled
 def first_of_three(members: int) -> int:
-    """Return the first of three successive channels; -1 if ``members`` are other channels."""
+    """Return the first of three successive channels, or -1 for other sets."""
     for i in range(MAX_CHANNELS):
         if members == 7 << i:
             return i
@@ -95,12 +97,21 @@ def first_of_three(members: int) -> int:
 def sum_changes(
     copies: Copies, line: DelayBuffer, source: int, target: int, lag: int, wanted: int
 ) -> bool:
-    """Sum the products of what the values of two units change by, from sample to sample, in ``copies.products``.
+    """Sum the products of the changes of two units to ``copies.products``.
 
-    The newest samples are summed until ``wanted`` changes are found; return whether
-    they are found within twice as many samples. ``source``, ``target``: first channel
-    of the unit that may be the original, and of the unit that may be the copy, later by
-    ``lag`` samples.
+    Parameters
+    ----------
+    source, target
+        First channel of the possible original, and of the possible copy.
+    lag
+        Delay of the copy, samples.
+    wanted
+        Number of changes, beginning with the newest.
+
+    Returns
+    -------
+    bool
+        Whether that many changes are within twice as many samples.
     """
     change, products, count = copies.change, copies.products, 0
     for i in range(6):
@@ -124,7 +135,10 @@ def sum_changes(
 
 @compiled
 def fill_change(line: DelayBuffer, first: int, k: int, out: Array, place: int) -> bool:
-    """Second differences of three channels up to sample k, into ``out``; return whether all are finite and in range."""
+    """Write second differences of three channels up to sample k to ``out``.
+
+    Return whether all values are finite and in range.
+    """
     new, middle = line.rows[k % RESTAMP_SAMPLES], line.rows[(k - 1) % RESTAMP_SAMPLES]
     old = line.rows[(k - 2) % RESTAMP_SAMPLES]
     for i in range(3):
@@ -140,9 +154,10 @@ def fill_change(line: DelayBuffer, first: int, k: int, out: Array, place: int) -
 def is_explained(
     copies: Copies, settings: PathSettings, target: int, count: int
 ) -> bool:
-    """Whether a linear map of the changes of one unit explains those of the other, and they are noise.
+    """Return whether a linear map of one unit's changes explains those of the other.
 
-    Elimination of the channels of the first unit leaves the unexplained part of the second.
+    The changes must also be noise. Elimination of the channels of the first unit leaves
+    the unexplained part of the second.
     """
     products, noise, size, trace = copies.products, 0.0, 0.0, 0.0
     for i in range(3):
@@ -152,7 +167,7 @@ def is_explained(
         noise += settings.sensors.noise_std[target + i] ** 2
     for p in range(3):
         pivot = products[p, p]
-        # A channel of which no more is its own adds nothing to what the others explain.
+        # A channel without a remainder adds no explanation to the others.
         if pivot > 1e-12 * trace:
             for i in range(p + 1, 6):
                 share = products[i, p] / pivot
@@ -165,7 +180,10 @@ def is_explained(
 
 
 def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
-    """Find pairs of series (N, 3) of one rate, rad/s, of which one is a copy of the other: their numbers."""
+    """Return pairs of series of which one is a copy of the other.
+
+    Each series has shape (N, 3), in rad/s, and all have the same sample rate.
+    """
     found = []
     line, copies, settings = (
         allocate(DelayBuffer),

@@ -18,12 +18,12 @@ from fdi_ros.model.samples import Array
 FINE, MISSING, NON_FINITE, OUT_OF_RANGE, FROZEN, SILENT, NON_FINITE_LASTING = map(
     int, Condition
 )
-NOT_BAD = -(1 << 62)  # instead of the stamp at which a run of non-finite values began
+NOT_BAD = -(1 << 62)  #: In place of the start of a run of non-finite values.
 
 
 @compiled
 def check(settings: PathSettings, health: Health, sample: Sample) -> None:
-    """Check the values of one sample; results in ``health.condition``."""
+    """Check the values of one sample. The results are in ``health.condition``."""
     n, stamp, received = settings.n, sample.stamp, sample.received
     if health.begun == 0:
         for i in range(n):
@@ -55,9 +55,9 @@ def check(settings: PathSettings, health: Health, sample: Sample) -> None:
 
 @compiled
 def silence_units(settings: PathSettings, health: Health) -> None:
-    """Take a unit that gives nothing but values that are not finite for one that gives nothing.
+    """Treat a unit with only non-finite values as silent.
 
-    Drivers fill in NaN while their device is away. That is no fault of a channel that would last.
+    Drivers send NaN while their device is absent, which is no lasting fault of a channel.
     """
     for u in range(settings.units):
         gone = members = 0
@@ -74,8 +74,8 @@ def silence_units(settings: PathSettings, health: Health) -> None:
 def receive(
     settings: PathSettings, health: Health, i: int, stamp: int, z: float
 ) -> int:
-    """Remember a value received of channel i; return its `Condition`."""
-    # Across a hole it is unknown what the value was: a run begins anew.
+    """Store a received value of channel i, and return its `Condition`."""
+    # During a hole the value is unknown, so a new run begins.
     step = stamp - health.received_stamp[i]
     hole = step > settings.stale_time
     health.received_stamp[i] = stamp
@@ -101,17 +101,19 @@ def receive(
 RANGES = tuple(
     math.radians(32767 / sensitivity) for sensitivity in (131, 65.5, 32.8, 16.4)
 )
-"""Largest rates that chips of 250, 500, 1000 and 2000 deg/s give, rad/s."""
+"""Largest output of chips with ranges of 250, 500, 1000 and 2000 deg/s, rad/s."""
 RAIL_SHARE, RAIL_OFFSET = 1e-3, 0.02
-"""A value is at the end of a range within this share of it and an offset, rad/s: sensitivities of makes differ, and a
-bias was taken off."""
-RAIL_REPEATS = 3  # values in a row, none larger before, that show an end of range: noise repeats no extreme
-UNKNOWN_RANGE = 36.0  # rad/s; a larger max_rate states a chip of more than 2000 deg/s
+"""Distance from the end of a range, as a share and in rad/s, within which a value is at
+the end: sensitivities of makes differ, and a bias may have been subtracted."""
+#: Equal largest values in a row that show the end of a range. Noise repeats no extreme.
+RAIL_REPEATS = 3
+#: A larger max_rate belongs to a chip of more than 2000 deg/s, rad/s.
+UNKNOWN_RANGE = 36.0
 
 
 @compiled
 def rail_of(size: float) -> float:
-    """Least value at the end of the range that a value of this size is at, rad/s; 0: it is at none."""
+    """Return the smallest value at the end of the range that a size reaches, rad/s, or 0."""
     for largest in RANGES:
         width = RAIL_SHARE * largest + RAIL_OFFSET
         if abs(size - largest) <= width:
@@ -121,14 +123,17 @@ def rail_of(size: float) -> float:
 
 @compiled
 def usual_limit(settings: PathSettings, i: int) -> float:
-    """Size from which values are out of range while no smaller range has shown, rad/s."""
+    """Return the size from which on values are out of range by the settings, rad/s."""
     stated = settings.max_rate[i]
     return min(stated, rail_of(RANGES[3])) if stated < UNKNOWN_RANGE else stated
 
 
 @compiled
 def follow_rail(settings: PathSettings, health: Health, i: int, z: float) -> None:
-    """Learn the range of a chip from an extreme value that repeats; a larger one shows that it is no end of range."""
+    """Learn the range of a chip from a repeated extreme value.
+
+    A later larger value shows that the extreme was no end of range.
+    """
     size = abs(z)
     health.repeats[i] = health.repeats[i] + 1 if z == health.value[i] else 1
     if size > health.extreme[i]:
@@ -142,24 +147,25 @@ def follow_rail(settings: PathSettings, health: Health, i: int, z: float) -> Non
 
 
 SHARE_TIME, SHARE_SAMPLES = 500_000_000, 50.0
-"""ns and values over which the share that is not finite is averaged, the longer: 50
-tell 15 % from 25 %."""
-# from which a channel is left out of the rate: drivers drop up to 10 % of single values
+"""Averaging time, ns, and number of values of the share of non-finite values. The longer
+one counts: 50 values distinguish 15 % from 25 %."""
+#: Share of non-finite values from which on a channel is left out of the rate. Drivers
+#: drop up to 10 % of single values.
 DOUBTED_SHARE = 0.15
-INTERMITTENT_SHARE = (
-    0.25  # from which it is faulty: 2.5 standard deviations of the average above that
-)
-# a value that is not finite, and the next two, are left out of the rate: they are no
-# better
+#: Share from which on a channel is faulty: 2.5 standard deviations above `DOUBTED_SHARE`.
+INTERMITTENT_SHARE = 0.25
+#: A non-finite value and the next two values are left out of the rate.
 RETURNING = 3
-LEAST_LEAVES = (
-    4.0  # least recent losses of an intermittent channel: one or two holes do not count
-)
+#: Least number of recent losses of an intermittent channel. Single holes do not count.
+LEAST_LEAVES = 4.0
 
 
 @compiled
 def follow_share(health: Health, i: int, finite: bool, step: int) -> None:
-    """Follow the share of the values of a channel that are not finite; step: since the value before, ns."""
+    """Update the share of non-finite values of a channel.
+
+    ``step`` is the time since the previous value, ns.
+    """
     adaptation_gain = min(step / SHARE_TIME, 1.0 / SHARE_SAMPLES)
     health.gone[i] += adaptation_gain * ((0.0 if finite else 1.0) - health.gone[i])
     health.leaves[i] *= 1.0 - adaptation_gain
@@ -169,19 +175,19 @@ def follow_share(health: Health, i: int, finite: bool, step: int) -> None:
 
 
 COMPLETE_SHARE, COMPLETE_TIME = 0.02, 4 * SHARE_TIME
-"""A unit with at most this share of lost samples over this time, ns, is not slow.
-Losses then are flicker."""
+"""A unit with at most this share of lost samples over this time, ns, is not slow. Later
+losses are flicker."""
 
 
 @compiled
 def follow_presence(
     health: Health, n: int, stamp: int, received: NDArray[np.uint8]
 ) -> None:
-    """Follow the share of samples that nothing was received for: no fault, as a link loses messages."""
+    """Update the share of samples without a value. This is no fault: links lose messages."""
     adaptation_gain = min((stamp - health.stamp) / SHARE_TIME, 1.0 / SHARE_SAMPLES)
     for i in range(n):
         if health.begun == 1:
-            # Nothing is known of the channel yet.
+            # The channel is still unknown.
             health.absent[i], health.complete_stamp[i] = 1.0, stamp
         health.absent[i] += adaptation_gain * (
             (0.0 if received[i] else 1.0) - health.absent[i]
@@ -198,7 +204,10 @@ def follow_presence(
 
 @compiled
 def intermittent_channels(gone: Array, leaves: Array, n: int, share: float) -> int:
-    """Bits of the channels of which at least a share comes and goes: shares gone (n,), and how often they went."""
+    """Return the mask of channels whose values come and go.
+
+    ``gone`` (n,) are shares of missing values, and ``leaves`` (n,) recent numbers of losses.
+    """
     found = 0
     for i in range(n):
         if gone[i] >= share and leaves[i] >= LEAST_LEAVES:
@@ -208,9 +217,9 @@ def intermittent_channels(gone: Array, leaves: Array, n: int, share: float) -> i
 
 @compiled
 def leave_flickering(core: Core, subsets: NDArray[Any]) -> None:
-    """Leave channels whose values seem to come and go out of the sample, where enough are left."""
+    """Leave channels whose values come and go out of the sample, if enough remain."""
     now, health, n = core.now, core.health, core.settings.n
-    # And those that were complete, and now lack samples again and again.
+    # Also channels that were complete, and now lack samples repeatedly.
     sparse = health.complete & intermittent_channels(
         health.absent, health.lapses, n, INTERMITTENT_SHARE
     )

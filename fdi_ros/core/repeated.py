@@ -3,9 +3,9 @@
 
 """Values that repeat while others move.
 
-A value that repeats is no defect by itself: a quantised sensor at rest repeats for
-minutes. It counts after a much longer time, or against motion that the others see along
-this channel's axis: then the channel is stuck, or the values of a whole unit are old.
+A repeated value alone is no defect: a quantised sensor at rest repeats for minutes. It is
+a defect after a much longer time, or if the others measure motion along this channel's
+axis: then the channel is stuck, or the values of a whole unit are old.
 
 A fault at rest looks like motion to every quiet channel beside it. The others are
 therefore evidence of motion only if they agree. The same channels must have seen the
@@ -27,30 +27,31 @@ from fdi_ros.core.records import Core, Current, Health, PathSettings, Subset
 from fdi_ros.core.subsets import fill_rate
 from fdi_ros.model.geometry import MIN_SENSITIVITY
 
-# standard deviations, beyond one step, that the others move by while a stuck value
-# repeats
+#: Motion of the others, beyond one step, that shows a stuck value, standard deviations.
 LEAST_MOTION = 6.0
 AGREED = 0.5
-"""Largest disagreement of the others, root sum of squares, as a share of the motion they
-see. A fault of one of three parallel channels moves their mean by a third of itself and
-leaves 0.8 of itself as disagreement; real motion leaves noise."""
-# of a quantised sensor, which repeats its value by chance until the body has moved this
-# far
+"""Largest disagreement of the others (root sum of squares) as a share of their motion. A
+fault of one of three parallel channels moves their mean by a third of itself and leaves 0.8
+of itself as disagreement. Real motion leaves only noise."""
+#: Motion, in steps, up to which a quantised sensor repeats its value by chance.
 STEPS = 3.0
 RESTS, AT_REST = 3.0, 1e-3
-"""At rest the rate is within three standard deviations of a channel, and a step of
-MAVLink in rad/s, of zero."""
-# standard deviations: noise takes a value over smaller steps with nearly every sample
+"""At rest the rate is at most three standard deviations of a channel plus one step of
+MAVLink, rad/s."""
+#: A larger step is coarse, standard deviations. Noise crosses smaller steps with nearly
+#: every sample.
 COARSE_STEP = 0.5
 ALL_REPEAT = 100_000_000
-"""ns that all channels repeat their values before none of them is believed: what a link
-may hold up. In coarse steps ``stuck_time``, if that is longer: gyros without noise
-repeat for longer in a steady turn."""
+"""Time for which all channels may repeat their values, ns: links may delay messages. In
+coarse steps ``stuck_time``, if longer: gyros without noise repeat in a steady turn."""
 
 
 @compiled
 def leave_one_out(settings: PathSettings, now: Current, subset: Subset) -> None:
-    """Predict each channel from the others of a subset, into ``now.prediction``, rad/s; NaN: not predicted."""
+    """Write the prediction of each channel by the others to ``now.prediction``, rad/s.
+
+    NaN if the others do not predict the channel.
+    """
     axes, rate = settings.sensors.axes, now.others_rate
     for i in range(settings.n):
         expected = along(axes[i], rate)
@@ -64,7 +65,7 @@ def leave_one_out(settings: PathSettings, now: Current, subset: Subset) -> None:
 
 @compiled
 def largest_step(settings: PathSettings, health: Health, now: Current) -> float:
-    """Largest step of the quantised channels, rad/s. The step of a channel that never changed is unknown."""
+    """Return the largest known step of the quantised channels, rad/s."""
     step = 0.0
     for i in range(settings.n):
         if now.usable >> i & 1:
@@ -76,7 +77,7 @@ def largest_step(settings: PathSettings, health: Health, now: Current) -> float:
 def fill_disagreement(
     settings: PathSettings, now: Current, subset: Subset, mask: int
 ) -> None:
-    """Sum the squares by which the channels of a mask other than each disagree, into ``now.disagreement``."""
+    """Write for each channel the sum of squared residuals of the others in the mask."""
     axes, rate, total = settings.sensors.axes, now.others_rate, 0.0
     fill_rate(subset, settings.n, mask, now.corrected, rate)
     for i in range(settings.n):
@@ -93,7 +94,10 @@ def fill_disagreement(
 
 @compiled
 def is_confirmed(settings: PathSettings, subset: Subset, mask: int, i: int) -> bool:
-    """Whether the rest checks each channel of a mask that measures along channel i; ``subset`` is of the mask."""
+    """Return whether each channel of a mask that measures along channel i is checked.
+
+    ``subset`` is that of the mask.
+    """
     axes = settings.sensors.axes
     for j in range(settings.n):
         unchecked = mask & ~subset.detectable & (1 << j)
@@ -106,19 +110,25 @@ def is_confirmed(settings: PathSettings, subset: Subset, mask: int, i: int) -> b
 def has_moved(
     core: Core, subset: Subset, others: int, i: int, least: float, step: float
 ) -> bool:
-    """Whether the others (their ``subset``) have measured motion along channel i while its value repeats."""
+    """Return whether the others have measured motion along channel i while it repeats.
+
+    ``subset`` is that of the others.
+    """
     now, noise = core.now, core.settings.sensors.noise_std[i]
     change = abs(now.prediction[i] - core.reference[i])
     if not (change > least + step and now.disagreement[i] < (AGREED * change) ** 2):
         return False
-    # The noise of a fine sensor never repeats: its repeated values need no second witness.
+    # The noise of a fine sensor never repeats, so its repeated values need no other check.
     coarse = step > COARSE_STEP * noise
     return not coarse or is_confirmed(core.settings, subset, others, i)
 
 
 @compiled
 def update_stuck(core: Core, subsets: NDArray[Any], mask: int, stamp: int) -> int:
-    """Bits of the channels that are stuck, judged by those in mask, the usable ones not under alarm themselves."""
+    """Return the mask of stuck channels.
+
+    ``mask`` has the usable channels without an alarm of their own, which measure motion.
+    """
     n, now, stuck, subset = core.settings.n, core.now, 0, subsets[mask]
     # Use uncorrected values: a change of the estimated errors is not motion.
     fill_rate(subset, n, mask, now.input, now.others_rate)
@@ -161,12 +171,11 @@ def add_stuck(settings: PathSettings, now: Current, evidence: int) -> None:
 
 @compiled
 def update_repeated(core: Core) -> int:
-    """Channels of the units that give old values: all of theirs again, while the others have measured motion."""
+    """Return the channels of units that repeat all their values while the others move."""
     members, sensors, found = core.settings.members, core.settings.sensors, 0
     for u in range(core.settings.units):
-        # A unit with a channel that gives nothing, or nothing in range, is none of
-        # these: what it gives is new, or the
-        # sample is without it. One of which a channel was declared may well be one.
+        # A unit with a missing or out-of-range channel does not count as repeating. A
+        # unit with a declared channel may.
         fresh, moved = members[u] & ~core.now.plain != 0, False
         for i in range(core.settings.n):
             if members[u] >> i & 1:
@@ -188,7 +197,7 @@ def update_repeated(core: Core) -> int:
 
 @compiled
 def is_at_rest(settings: PathSettings, now: Current) -> bool:
-    """Whether the channels in use show a vehicle at rest."""
+    """Return whether the channels in use show a vehicle at rest."""
     least = RESTS * settings.largest_noise + AT_REST
     return square(now.rate) < least * least
 
@@ -197,13 +206,13 @@ def is_at_rest(settings: PathSettings, now: Current) -> bool:
 def all_repeat(
     settings: PathSettings, health: Health, now: Current, stamp: int
 ) -> bool:
-    """Whether all channels have repeated their values, bit for bit, so long that the data source must have stalled.
+    """Return whether all channels repeat exactly for so long that the source has stalled.
 
-    A real gyro toggles its last bits even at rest, unless they are coarse. All gyros at
-    once do not stand still.
+    The last bits of a real gyro change even at rest, unless the steps are coarse. Not all
+    gyros repeat at once.
     """
     step, noise = largest_step(settings, health, now), settings.largest_noise
-    # Noise of which nothing is left in steps of a link, 1 mrad/s, is less than the one expected.
+    # A link with steps of 1 mrad/s may hide noise that is less than expected.
     coarse = step == 0.0 or step > COARSE_STEP * noise or step > COARSE_STEP * AT_REST
     if not now.usable or (coarse and is_at_rest(settings, now)):
         return False

@@ -1,12 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples to one instant, by the delays of the units.
+"""Correction of samples to one instant, by the delays of the units.
 
-A delay that is estimated in flight leaves the stamps alone: where those of unit u are
-late by T_u, the value of the instant t is the one stamped t + T_u. So a sample stands
-for the instant that lies the largest delay back. The latest unit gives its values as
-they are, the others are interpolated between their samples.
+Delays estimated in flight do not change stamps. If the stamps of unit u are late by T_u, the
+value at time t has the stamp t + T_u. A sample is corrected to its stamp less the largest
+delay. Values of the latest unit are used unchanged, and the others are interpolated.
 """
 
 from __future__ import annotations
@@ -29,12 +28,23 @@ def restamp(
     plain: int,
     out: Array,
 ) -> int:
-    """Keep a sample; fill ``out`` (n,) with the values of the instant for which the sample stands, NaN where missing.
+    """Store a sample, and write the values at its corrected instant to ``out`` (n,).
 
-    ``received``, ``plain``: bits of the values received, and of those finite and in
-    range; ``late`` (units,): by how much the stamps of each unit are late, s. Returned
-    are the bits of the channels that have a value, of the instant that the largest
-    delay lies before the stamp.
+    Parameters
+    ----------
+    late
+        Delay of the stamps of each unit, s, (units,).
+    sample
+        The sample.
+    received, plain
+        Masks of the values received, and of those finite and in range.
+    out
+        Receives the values, NaN where missing.
+
+    Returns
+    -------
+    int
+        Mask of the channels with a value.
     """
     n, units, members, stamp = (
         settings.n,
@@ -66,11 +76,11 @@ def restamp(
 
 @compiled
 def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: Array) -> int:
-    """Interpolate some channels at a stamp, into ``out``; return bits of the channels that have a value.
+    """Interpolate some channels at a stamp. Return the mask of the channels with a value.
 
-    By the cubic through the two samples before and the two after it; where one of the
-    outer two is missing, or not there yet, by the line through the inner ones. Between
-    a value in range and one out of it, or none, there is none.
+    The interpolation is cubic through two samples before and two after the stamp. If one
+    of the outer samples is missing or not yet received, the interpolation is linear.
+    Between a value in range and one out of range or missing, no value exists.
     """
     k = line.count - 1
     oldest = max(line.count - RESTAMP_SAMPLES, 0)
@@ -95,7 +105,7 @@ def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: Array)
     ):
         outer = ~(first.plain ^ before.plain) & ~(last.plain ^ before.plain)
         curved = found & first.received & last.received & outer
-    # Places of the outer two where the inner ones are 0 and 1.
+    # Positions of the outer samples if those of the inner ones are 0 and 1.
     a, b = (
         (first.stamp - before.stamp) / max(span, 1),
         (last.stamp - before.stamp) / max(span, 1),
@@ -109,7 +119,7 @@ def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: Array)
                 else math.nan
             )
             if curved >> i & 1:
-                # The remainder of the outer two, over s (1 - s), is a line through two values.
+                # The remainder of the outer two, divided by s (1 - s), is linear.
                 rise = after.values[i] - before.values[i]
                 low = (first.values[i] - before.values[i] - a * rise) / (a * (1.0 - a))
                 high = (last.values[i] - before.values[i] - b * rise) / (b * (1.0 - b))

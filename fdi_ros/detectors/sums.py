@@ -3,9 +3,8 @@
 
 """Evidence at four time scales: Shiryaev-Roberts sums over channels, signs and sizes of a fault.
 
-The values are innovations of samples, of blocks, and of longer times. A large sum is
-looked back at: since when its channel is off, and how far beyond the scatter of that
-same time.
+The values are innovations of samples, blocks and longer times. For a large sum, the onset
+of the fault is estimated, and its size relative to the scatter since the onset.
 """
 
 from __future__ import annotations
@@ -39,20 +38,20 @@ from fdi_ros.estimator.noise import (
 from fdi_ros.estimator.shared_noise import update_shared
 from fdi_ros.model.samples import Array
 
-SIZES, KEPT = 6, 64  # of a fault; values of each time scale that are looked back at
-PER_BLOCK = (0, 1, 6, 48)  # blocks in a value of each time scale; 0: samples
+SIZES, KEPT = 6, 64
+"""Number of sizes of a fault, and of stored values of each time scale."""
+#: Blocks in a value of each time scale. The first one has samples.
+PER_BLOCK = (0, 1, 6, 48)
 SMALLEST = 0.2
-"""Smallest size of a fault, in standard deviations at its time scale; each next one is
-twice as large, up to 6.4. From one to the next at most 11 % of the delay are lost, and
-smaller faults are found at a longer time scale."""
-# sizes left out at the longest time scale: less than 0.8 there is a walk of the bias
+"""Smallest size of a fault, in standard deviations at its time scale. Each further size is
+twice as large, up to 6.4. Sizes in between cost at most 11 % of the delay, and smaller
+faults are found at a longer time scale."""
+#: Number of sizes left out at the longest time scale: below 0.8 is a walk of the bias.
 FIRST_LONG = 2
-# a value counts as this many standard deviations at most (Huber 1965): beyond the
-# largest size
+#: Values are limited to this many standard deviations (Huber 1965).
 STEP_LIMIT = 7.0
-CEILING = (
-    1e6  # sums stay below so many times the threshold: what has passed is forgotten
-)
+#: Sums are limited to this multiple of the threshold, so that past faults fade.
+CEILING = 1e6
 Sums = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS, SIZES)]
 Series = Annotated[NDArray[np.float64], "f8", (KEPT, MAX_CHANNELS)]
 Firsts = Annotated[NDArray[np.int64], "i8", (KEPT,)]
@@ -63,13 +62,13 @@ class Scale:
     """Evidence of one time scale."""
 
     filled: Whole  # blocks in the value being filled
-    values: Channels  # sum of their A y, s/rad
-    information: Channels  # sum of their A_ii, s^2/rad^2
-    newest: Whole  # place of the last value
-    kept: Whole  # values that may be looked back at
+    values: Channels  # sum of A y over these blocks, s/rad
+    information: Channels  # sum of A_ii over these blocks, s^2/rad^2
+    newest: Whole  # index of the last value
+    kept: Whole  # number of stored values
     series: Series  # values, in standard deviations
-    first: Firsts  # number of the first sample in each
-    sums: Sums
+    first: Firsts  # number of the first sample in each value
+    sums: Sums  # by sign, channel and size
     total: Real  # of all sums
 
 
@@ -80,7 +79,7 @@ Scales = Annotated[list[Scale], SCALES]
 def add_evidence(
     params: Constants, kf: Estimator, scale: Scale, at: int, first_sample: int
 ) -> None:
-    """Take the last values y of a time scale, in its series, into its sums: R <- (1 + R) exp(s y - s^2 / 2)."""
+    """Add the last values y of a time scale to its sums, R <- (1 + R) exp(s y - s^2 / 2)."""
     first, ceiling = FIRST_LONG if at == LONG else 0, CEILING * params.limit
     scale.first[scale.newest] = first_sample
     scale.kept = min(scale.kept + 1, KEPT)
@@ -107,13 +106,16 @@ def add_evidence(
 
 @compiled
 def value_at(scale: Scale, back: int, i: int) -> float:
-    """Return the value of channel i so many before the last one."""
+    """Return the value of channel i that is ``back`` values before the last one."""
     return scale.series[(scale.newest - back + KEPT) % KEPT, i]
 
 
 @compiled
 def scatter_of(scale: Scale, i: int, sign: float, count: int, mean: float) -> float:
-    """Variance of a mean of the last values times their number: of single ones, or of batches if that is more."""
+    """Return the variance of a mean of the last values, times their number.
+
+    The larger estimate counts, from single values or from batches.
+    """
     worst, size = 0.0, 1
     while count // size >= 4 or size == 1:
         batches, squares = count // size, 0.0
@@ -131,12 +133,13 @@ def scatter_of(scale: Scale, i: int, sign: float, count: int, mean: float) -> fl
 def look_back(
     params: Constants, kf: Estimator, scale: Scale, i: int, sign: float
 ) -> tuple[int, float]:
-    """Find since when channel i is off, and the evidence for it against the noise of that same time.
+    """Estimate the onset of a fault of channel i, and its evidence against the scatter.
 
     Returns
     -------
-    Values since the onset, and the logarithm of the likelihood ratio: Student's, with
-    the degrees of freedom of the learned noise and of the values themselves.
+    tuple
+        Number of values since the onset, and the logarithm of Student's likelihood ratio
+        with the degrees of freedom of the learned noise and of the values.
     """
     best, since, total = 0.0, 0, 0.0
     for k in range(scale.kept):
@@ -154,7 +157,7 @@ def look_back(
             for k in range(since - 1):
                 step = value_at(scale, k, j) - value_at(scale, k + 1, j)
                 squares += min(0.5 * step * step, FAR)
-    # Of so many channels three fewer differ from what a rate explains.
+    # A rate explains three dimensions of the channels.
     checks = max(count - 3.0, 1.0)
     pooled = (trust + squares / max(count, 1) * checks) / (
         trust + checks * (since - 1.0)
@@ -171,7 +174,7 @@ def look_back(
 def update_from_sample(
     params: Constants, kf: Estimator, scales: Scales, learns: bool
 ) -> None:
-    """Take the statistics of a sample into the noise and the sums."""
+    """Update noise and sums with the statistics of a sample."""
     scale, noise = scales[SAMPLE], kf.noise
     noise.seen[SAMPLE] += 1.0
     scale.newest = (scale.newest + 1) % KEPT
@@ -199,7 +202,7 @@ def update_from_sample(
 def update_from_block(
     params: Constants, kf: Estimator, scales: Scales, learns: bool
 ) -> None:
-    """Take the innovations of a block into the noise and the sums of the longer time scales."""
+    """Update noise and sums of the longer time scales with the innovations of a block."""
     noise, n = kf.noise, params.sensors.n
     mask, information = kf.masks[1] & kf.judged, kf.block_parity.information
     for k in range(1, SCALES):
@@ -235,7 +238,7 @@ def update_from_block(
 
 @compiled
 def mean_of(params: Constants, kf: Estimator, scales: Scales) -> float:
-    """Mean of all sums."""
+    """Return the mean of all sums."""
     total, channels = 0.0, 0
     for k in range(SCALES):
         total += scales[k].total
@@ -248,7 +251,7 @@ def mean_of(params: Constants, kf: Estimator, scales: Scales) -> float:
 def fill_scores(
     params: Constants, kf: Estimator, scales: Scales, scores: Array
 ) -> None:
-    """Logarithm of one plus the largest sum of each channel that is judged, NaN of others; scores (n,) takes them."""
+    """Write log(1 + largest sum) of each judged channel to scores (n,), NaN for others."""
     for i in range(params.sensors.n):
         largest = 0.0
         for k in range(SCALES):
@@ -261,7 +264,7 @@ def fill_scores(
 
 @compiled
 def forget_sums(params: Constants, scales: Scales) -> None:
-    """Begin all sums anew."""
+    """Reset all sums."""
     for k in range(SCALES):
         scale = scales[k]
         scale.kept = scale.filled = 0
