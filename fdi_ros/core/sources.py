@@ -87,14 +87,14 @@ class Source(ABC):
     @staticmethod
     @abstractmethod
     def place(data: Bytes, offset: int, length: int, count: int) -> int:
-        """Return where count values begin in a message; what is wrong, negative, if they cannot be there."""
+        """Return the index of ``count`` values in a message, or a negative error code."""
 
     @staticmethod
     @abstractmethod
     def decode_into(
         data: Bytes, offset: Int, length: Int, code: Bytes, stamp: Int, values: Array
     ) -> None:
-        """Read k messages; code (k,), stamp (k,) and values (k, c), zeros before, take what each holds."""
+        """Read k messages into code (k,), stamp (k,) and values (k, c), which are zero before."""
 
     @staticmethod
     @abstractmethod
@@ -113,7 +113,7 @@ class Source(ABC):
 
     @classmethod
     def explain(cls, code: int, data: bytes, count: int) -> str:
-        """Explain in one line what is wrong with a message in which count values were expected."""
+        """Return one line on the error of a message that should have ``count`` values."""
         size, order = len(data), byte_order(data)
         if code == NO_CDR:
             return f"{size} bytes with encapsulation {data[:2].hex() or 'none'} are no plain CDR"
@@ -152,7 +152,10 @@ class Source(ABC):
 
     @classmethod
     def parse(cls, data: bytes, count: int) -> tuple[int, tuple[float, ...]]:
-        """Read stamp (ns; 0: it carries none) and values (count,) rad/s of one message, or raise `MessageError`."""
+        """Return stamp, ns, and values (count,), rad/s, of one message.
+
+        The stamp is 0 for messages without one. Raise `MessageError` for a malformed one.
+        """
         (code,), (stamp,), (values,) = cls.decode(*as_batch(data), count)
         if code != GOOD:
             raise MessageError(cls.explain(int(code), data, count))
@@ -160,7 +163,10 @@ class Source(ABC):
 
     @classmethod
     def patch(cls, data: bytes, values: Sequence[float]) -> bytes:
-        """Return a message with other values, as many, rad/s, and all else as it was, or raise `MessageError`."""
+        """Return a message with as many other values, rad/s, and the rest unchanged.
+
+        Raise `MessageError` for a malformed message.
+        """
         at = cls.place(as_batch(data)[0], 0, len(data), len(values))
         if at < 0:
             raise MessageError(cls.explain(-at, data, len(values)))
@@ -214,7 +220,7 @@ class Source(ABC):
 
 
 class UnitSource(Source):
-    """One topic per three-axis unit: messages with a std_msgs/Header, aligned by their stamps; settings ``imus``."""
+    """One topic per three-axis unit, with messages aligned by stamps (settings ``imus``)."""
 
     stamped = True
     topic_counts, value_counts = range(2, MAX_UNITS + 1), range(3, 4)
@@ -268,11 +274,11 @@ def _imu_place(data: Bytes, offset: int, length: int, count: int) -> int:
 
 @compiled
 def _imu_read(data: Bytes, offset: int, length: int, rate: Array) -> int:
-    """Read the rate of an Imu into rate (3,), and return its stamp, ns; or the code of what is wrong, negative."""
+    """Read the rate of an Imu into rate (3,). Return its stamp, ns, or a negative error code."""
     at = _imu_place(data, offset, length, 3)
     if at >= 0:
         first = np.int64(read_bits(data, at + 24, 8, data[offset + 1] == 1))
-        # REP-145: the first element of the covariance of what is not measured.
+        # REP-145: -1 in the covariance means that the rate is not measured.
         if first.view(np.float64) == -1.0:
             return -NO_RATE
     return read_rate(data, offset, length, IMU_BEFORE_RATE, IMU_DOUBLES, rate)
@@ -325,14 +331,14 @@ class ImuSource(UnitSource):
 
     @classmethod
     def explain(cls, code: int, data: bytes, count: int) -> str:
-        """Explain in one line what is wrong with a message."""
+        """Return one line on the error of a message."""
         if code == NO_RATE:
             return "angular_velocity_covariance[0] is -1: this Imu measures no angular rate (REP-145)"
         return super().explain(code, data, count)
 
     @classmethod
     def patch(cls, data: bytes, values: Sequence[float]) -> bytes:
-        """Return a message with another rate, and with six values another specific force, all else as it was."""
+        """Return a message with another rate, and with six values also another specific force."""
         patched = super().patch(data, values[:3])
         if len(values) == 6:
             at = cls.place(as_batch(data)[0], 0, len(data), 3) + 8 * IMU_BEFORE_FORCE
@@ -354,7 +360,7 @@ _DIMENSIONS, _CUT_ARRAY, _WRONG_COUNT, _CUT_VALUES, _GAPS = range(
 
 @compiled
 def _count_at(data: Bytes, offset: int, length: int) -> int:
-    """Return where the number of values of an array stands; what is wrong, negative, if that cannot be known."""
+    """Return the index of the number of values of an array, or a negative error code."""
     if not is_cdr(data, offset, length):
         return -NO_CDR
     little = data[offset + 1] == 1
@@ -393,7 +399,7 @@ def _array_place(data: Bytes, offset: int, length: int, count: int) -> int:
     before = read_bits(data, at - 4, 4, little)  # values that are padding
     if read_bits(data, at, 4, little) != before + count:
         return -_WRONG_COUNT
-    # The first byte of the values is aligned even where there is none.
+    # The values are aligned even if the array is empty.
     start = ENCAPSULATION + (at + 4 - offset - ENCAPSULATION + 7) // 8 * 8
     if start + 8 * (before + count) > length:
         return -_CUT_VALUES
@@ -506,5 +512,5 @@ def input_of(kind: type[Source]) -> str:
 
 
 def source_of_type(message_type: str) -> type[Source] | None:
-    """Return the kind of input of a message type, ``sensor_msgs/msg/Imu``; None: no gyros are read from it."""
+    """Return the kind of input of a message type, or None if it contains no gyros."""
     return next((kind for kind in SOURCES.values() if kind.type == message_type), None)
