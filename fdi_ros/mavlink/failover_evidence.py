@@ -227,7 +227,7 @@ class Evidence:
         self._sizes = [UNKNOWN] * count  # largest of late, by axis, rad/s
         # Doubts of the monitor that agreement has refuted. None: the IMU is not trusted.
         self._refuted: list[set[ChannelState] | None] = [None] * count
-        # Axes that are FAULTY, since when while the IMU agrees, ns, and those of them that
+        # Axes that are FAULTY or in a set, since when while the IMU agrees, ns, and those of them that
         # have been so for `TRUSTED`.
         self._named: list[set[int]] = [set()] * count
         self._named_at = [0] * count
@@ -285,8 +285,9 @@ class Evidence:
                 x, y, z = map(max, vector, before)
                 vector = x, y, z
             self._sizes[k] = vector
-            named = self._faulty(k)
-            accused = set(named)
+            faulty = self._axes(k, ChannelState.FAULTY)
+            accused = faulty | axes if k == odd else faulty
+            named = faulty | self._axes(k, ChannelState.AMBIGUOUS)
             if agreed is None or named != self._named[k]:
                 self._named[k] = named
                 self._named_at[k] = now
@@ -294,13 +295,11 @@ class Evidence:
                 self._outdated[k] = named
             self._outdated[k] = self._outdated[k] & named
             if not self._is_odd(k, units, apart):
-                accused -= self._outdated[k]
-            if k == odd:
-                accused |= axes
+                accused = accused - self._outdated[k]
             is_unknown = not self._states[k] and k != odd
             imus.append(
                 Imu(
-                    named=None if is_unknown else bool(named or k == odd),
+                    named=None if is_unknown else bool(faulty or k == odd),
                     blamed=any(vector[axis] >= self._min_size for axis in accused),
                     ok=set(self._states[k]) == {ChannelState.OK},
                     delivers=delivers[k],
@@ -340,10 +339,10 @@ class Evidence:
     def _doubts(self, unit: int) -> set[ChannelState]:
         return DOUBTS.intersection(self._states[unit])
 
-    def _faulty(self, unit: int) -> set[int]:
-        """Return the axes of an IMU that the monitor finds faulty."""
+    def _axes(self, unit: int, wanted: ChannelState) -> set[int]:
+        """Return the axes of an IMU to which the monitor gives a state."""
         states = enumerate(self._states[unit])
-        return {axis for axis, state in states if state == ChannelState.FAULTY}
+        return {axis for axis, state in states if state == wanted}
 
     def _partners(
         self, unit: int, units: Sequence[int], out: Sequence[int]
@@ -405,18 +404,14 @@ class Evidence:
             sizes = [apart[k, j] for j in units if j != k]
             axes = {
                 axis
-                for axis in self._set(k)
+                for axis in self._axes(k, ChannelState.AMBIGUOUS)
                 if min(size[axis] for size in sizes) >= VOTE * self._min_size
             }
             if axes:
                 return k, axes, LASTING
-        sets = [k for k in units if self._set(k)]
-        return (sets[0], self._set(sets[0]), LASTING) if len(sets) == 1 else NOBODY
-
-    def _set(self, unit: int) -> set[int]:
-        """Return the axes of an IMU that are in a set of the monitor."""
-        states = enumerate(self._states[unit])
-        return {axis for axis, state in states if state == ChannelState.AMBIGUOUS}
+        sets = {k: self._axes(k, ChannelState.AMBIGUOUS) for k in units}
+        found = [(k, axes, LASTING) for k, axes in sets.items() if axes]
+        return found[0] if len(found) == 1 else NOBODY
 
     def _clear_axes(self, unit: int, units: Sequence[int], now: int) -> set[int]:
         """Return the axes on which an IMU is far off from both others, in one direction.

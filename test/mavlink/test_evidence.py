@@ -227,11 +227,14 @@ def test_a_name_on_another_axis_is_no_witness() -> None:
     assert watched.blamed(1.0) == {0}
 
 
-def test_of_two_imus_an_old_name_is_no_witness_against_a_new_difference() -> None:
+@pytest.mark.parametrize("state", [FAULTY, AMBIGUOUS])
+def test_of_two_imus_an_old_name_is_no_witness_against_a_new_difference(
+    state: int,
+) -> None:
     """The monitor remembers a fault that is over; then the other gyro fails."""
     watched = Watched(2)
     watched.gyros[0] = biased(0.3)
-    watched.states[0] = FAULTY
+    watched.states[0] = state
     assert watched.blamed(1.0) == {0}
     watched.gyros[0] = sound
     watched.run(4.0)
@@ -241,7 +244,7 @@ def test_of_two_imus_an_old_name_is_no_witness_against_a_new_difference() -> Non
     watched.gyros[1] = sound
     watched.states[0] = OK
     watched.run(1.0)
-    watched.states[0] = FAULTY
+    watched.states[0] = state
     watched.gyros[0] = biased(0.3)
     assert watched.blamed(1.0) == {0}
 
