@@ -7,7 +7,7 @@ import json
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -107,14 +107,24 @@ class Monitored(Conversation):
 
 def kept(talk: Monitored, folder: Path, out: Sequence[int] = (1,)) -> tuple:
     """System and IMUs in the file; a thread writes it, so the flight goes on meanwhile."""
-    end = time.monotonic() + 10.0
-    while time.monotonic() < end:
-        content = json.loads((folder / "out.json").read_text())
-        if content["out_of_use"] == list(out):
-            break
+    file, content = folder / "out.json", {"system_id": 0, "out_of_use": []}
+
+    def is_written() -> bool:
+        if file.exists():
+            content.update(json.loads(file.read_text()))
+        return file.exists() and content["out_of_use"] == list(out)
+
+    until(talk, is_written)
+    return content["system_id"], content["out_of_use"]
+
+
+def until(talk: Monitored, condition: Callable[[], bool]) -> bool:
+    """Fly on until something has come about that a thread does; whether it has."""
+    end = time.monotonic() + 60.0
+    while not condition() and time.monotonic() < end:
         time.sleep(0.02)
         talk.run(0.02)
-    return content["system_id"], content["out_of_use"]
+    return condition()
 
 
 @pytest.fixture
@@ -536,14 +546,9 @@ def test_a_file_that_cannot_be_written_in_flight_is_announced_and_written_later(
         file.unlink()
     tmp_path.rmdir()
     flying.fault(1, 0.3, seconds=1.0)
-    assert flying.failover.status(flying.now)[1].endswith(
-        "of system 1; failover_file is not written"
-    )
+    words = "of system 1; failover_file is not written"
+    assert until(flying, lambda: flying.failover.status(flying.now)[1].endswith(words))
     tmp_path.mkdir()
-    end = time.monotonic() + 10.0
-    while not (tmp_path / "out.json").exists() and time.monotonic() < end:
-        time.sleep(0.02)
-        flying.run(0.1)
     assert kept(flying, tmp_path) == (1, [1])
 
 

@@ -7,7 +7,7 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,14 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros.processes import PATIENCE, ROOT, Process, parameter_file, running, wait
+from ros.processes import (
+    PATIENCE,
+    ROOT,
+    Process,
+    parameter_file,
+    running,
+    wait,
+)
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
@@ -192,17 +199,26 @@ class Listener(Node):
             if status.name in names
         ]
 
-    def says(self, name: str, words: str) -> str:
-        """What a status comes to say with these words in it, or has said since `clear`, the last; empty if nothing."""
+    def says(
+        self,
+        name: str,
+        words: str,
+        meanwhile: Callable[[], object] = lambda: None,
+    ) -> str:
+        """Return the last status with these words in it since `clear`, once it has come; empty if none comes.
+
+        ``meanwhile`` is done again and again: a busy monitor may have no time to report on
+        inputs before they are silent, so they must go on.
+        """
         said: list[str] = []
-        if wait(
-            lambda: (
-                said.extend(
-                    s.message for s in self._statuses(name) if words in s.message
-                )
-                or said
-            )
-        ):
+
+        def has_come() -> bool:
+            said.extend(s.message for s in self._statuses(name) if words in s.message)
+            if not said:
+                meanwhile()
+            return bool(said)
+
+        if wait(has_come):
             return said[-1]
         print(
             f"{name} never said {words!r}; it says:", *self.diagnostics[-1:], sep="\n"

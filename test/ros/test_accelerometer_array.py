@@ -64,4 +64,4 @@ def test_an_injected_fault_of_an_array_of_accelerometers_is_named(
         last = said()
         others = [name for name in NAMES if name != "a3"]
         assert ChannelState.FAULTY not in [last[f"state {name}"] for name in others]
-        assert listener.says("a3", "isolated")
+        assert listener.says("a3", "isolated", meanwhile=said)

@@ -48,7 +48,7 @@ def test_it_pauses_where_it_is_and_begins_anew_in_a_namespace(flight) -> None:
         heard, _ = (listener.hear(f"/drone/imu_{k}/data_raw") for k in (1, 2))
         remaps = ("__ns:=/drone", "/clock:=clock")
         with running(
-            "player_node", FILE, *remaps, bag=flight, rate=50.0, loop=True
+            "player_node", FILE, *remaps, bag=flight, rate=20.0, loop=True
         ) as playing:
             assert wait(lambda: len(heard) > 100, 2 * PATIENCE), playing.said()
             # The clock of one vehicle, if it is remapped so, is not that of all.
@@ -68,7 +68,7 @@ def test_it_pauses_where_it_is_and_begins_anew_in_a_namespace(flight) -> None:
             assert wait(lambda: (np.diff(stamps_of(heard)) < 0).any()), playing.said()
     stamps = stamps_of(heard)
     steps = np.diff(stamps)
-    # The pause, at least 15 s of the recording, is not left out.
+    # The pause, at least 6 s of the recording, is not left out.
     assert 0 < steps[held - 1] < 5 * 10**9
     (first, *_) = np.flatnonzero(steps < 0)
     assert abs(stamps[first + 1] - min(stamps)) < 5 * 10**9
@@ -143,8 +143,8 @@ def test_damaged_times_are_not_waited_for(tmp_path: Path) -> None:
         assert playing.popen.wait(timeout=PATIENCE) == 0, playing.said()
         # At its pace, all the same.
         assert time.monotonic() - start > 0.9
-        # A subscriber may miss the very first, and a player that has ended sends nothing again.
-        assert wait(lambda: sum(map(len, heard)) >= 190), playing.said()
+        # A subscriber may miss the first, and a player that has ended sends nothing again.
+        assert wait(lambda: sum(map(len, heard)) > 150), playing.said()
     assert playing.said().count("which is not waited for") >= 2
 
 

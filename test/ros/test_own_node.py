@@ -129,10 +129,15 @@ for file in ({str(parameter_file(TWO_IMUS, tmp_path))!r}, {str(dump)!r}):
 
 @pytest.mark.parametrize("number", STOPPING)
 def test_a_signal_before_it_is_up_ends_it_at_once(tmp_path, number) -> None:
-    process = Process("fdi_node", parameter_file(TWO_IMUS, tmp_path))
-    maps = Path(f"/proc/{process.popen.pid}/maps")
-    assert wait(lambda: "librcl" in maps.read_text(), 20)
-    assert process.end(number) == -number
+    file = parameter_file(TWO_IMUS, tmp_path)
+    for _ in range(5):
+        process = Process("fdi_node", file)
+        maps = Path(f"/proc/{process.popen.pid}/maps")
+        assert wait(lambda maps=maps: "librcl" in maps.read_text())
+        # On a busy machine it may be up by now, and ends as asked for.
+        if (code := process.end(number)) != 0:
+            break
+    assert code == -number
     assert process.said() == ""
 
 
@@ -310,8 +315,9 @@ def test_channels_in_one_array_are_judged_as_the_pipeline_judges_them(tmp_path) 
             for told in (listener.stamps(), listener.states(), listener.rates())
         )
         assert stamps == sorted(set(stamps))
-        assert listener.says("g5", "isolated")
         assert wait(lambda: listener.value("input gyros", "malformed") == "4")
+        last = z[-1].tolist()
+        assert listener.says("g5", "isolated", lambda: listener.send_channels(last))
         pipeline = Pipeline.from_config(config)
         # As the node's, it has seen a second at rest, and then nothing for a while.
         before = stamps[0] - 1_000_000_000 - 4_000_000 * np.arange(250, 0, -1)
@@ -368,7 +374,11 @@ def test_what_is_odd_about_clocks_is_named_and_lived_with(tmp_path) -> None:
         # One clock behind the other.
         listener.calm()
         listener.play(healthy(500)[1], skew=-40_000_000)
-        said = listener.says("input imu_2", "behind those of the other inputs")
+        said = listener.says(
+            "input imu_2",
+            "behind those of the other inputs",
+            lambda: listener.play(healthy(50)[1], skew=-40_000_000),
+        )
         assert wait(lambda: len(listener.fused) > 450)
         # Ten samples behind; nine where the one of the other unit came after it.
         assert 32 <= float(re.search(r"stamps are ([\d.]+) ms behind", said)[1]) <= 40.1

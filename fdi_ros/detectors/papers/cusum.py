@@ -22,7 +22,7 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
-from fdi_ros.core.algebra import along
+from fdi_ros.core.algebra import along, dot
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.core.sensors import variance_of
 from fdi_ros.detectors.base import Detector
@@ -289,10 +289,8 @@ def plain_variances(params: Constants, sample: SampleInput, state: State) -> Non
             sensors, j, along(sensors.axes[j], rate), sample.acceleration
         )
     for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += params.squares[i, j] * state.room.variance[j]
-        state.variance[i] = max(total, 1.0)
+        variance = dot(params.squares[i], state.room.variance, n)
+        state.variance[i] = max(variance, 1.0)
 
 
 class Cusum(Detector):

@@ -25,6 +25,7 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
+from fdi_ros.core.algebra import dot
 from fdi_ros.core.records import SampleInput, SampleVerdict
 from fdi_ros.detectors.base import NoState
 from fdi_ros.detectors.papers.single_fault import (
@@ -40,7 +41,6 @@ from fdi_ros.detectors.papers.single_fault import (
     resting_std,
     set_forms,
     std_of,
-    value_of,
     worst,
 )
 from fdi_ros.model.geometry import ROUNDING, Geometry
@@ -78,7 +78,7 @@ def judge_one_norm(
     for b in range(params.sets):
         norm = 0.0
         for k in range(n - 3):
-            norm += abs(value_of(params.solutions[b, k], z, n))
+            norm += abs(dot(params.solutions[b, k], z, n))
             if norm >= least:
                 break
         if norm < least:
@@ -86,7 +86,7 @@ def judge_one_norm(
     # The scores of all other channels are already zero.
     for k in range(n - 3):
         verdict.scores[params.channels[best, k]] = abs(
-            value_of(params.solutions[best, k], z, n)
+            dot(params.solutions[best, k], z, n)
         )
     conclude_by_error(params, sample, verdict)
 
@@ -232,9 +232,7 @@ def judge_innovations(
         before, last = 0.0, 0.0
         for k in range(n - 3):
             form = params.forms[k, i]
-            innovation = value_of(form, sample.z, n) / std_of(
-                params, form, 1.0, verdict
-            )
+            innovation = dot(form, sample.z, n) / std_of(params, form, 1.0, verdict)
             before, last = last, innovation * innovation
             largest = max(largest, last)
         verdict.scores[i] = last / (before + NOTHING) if n > 4 else last
@@ -344,7 +342,7 @@ def judge_determinants(
     statistic = 0.0
     fill_variances(params, sample, verdict)
     for j in range(CHANNELS):
-        size = abs(value_of(params.forms[0, j], sample.z, CHANNELS))
+        size = abs(dot(params.forms[0, j], sample.z, CHANNELS))
         # A determinant that is always zero has no standard deviation.
         if size > 0:
             std = std_of(
@@ -371,11 +369,11 @@ def condition_without(params: Struck, j: int, sample: SampleInput) -> float:
     u, z = params.complement[j], sample.z
     s, t, v = params.singular[j, 0], params.singular[j, 1], params.singular[j, 2]
     a, b, c = (
-        value_of(u[0], z, CHANNELS),
-        value_of(u[1], z, CHANNELS),
-        value_of(u[2], z, CHANNELS),
+        dot(u[0], z, CHANNELS),
+        dot(u[1], z, CHANNELS),
+        dot(u[2], z, CHANNELS),
     )
-    delta = abs(value_of(u[3], z, CHANNELS))
+    delta = abs(dot(u[3], z, CHANNELS))
     largest = largest_root(
         (a * a, b * b, c * c, delta * delta), (s * s, t * t, v * v, 0.0)
     )

@@ -30,6 +30,7 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
+from fdi_ros.core.algebra import dot, variance_along
 from fdi_ros.core.records import SampleInput, SampleVerdict, Sensors
 from fdi_ros.core.sensors import variance_of
 from fdi_ros.detectors.base import Detector, NoState
@@ -69,15 +70,6 @@ def largest_form_threshold(
     return max_normal_threshold(
         directions / np.linalg.norm(directions, axis=1, keepdims=True), probability
     )
-
-
-@compiled
-def value_of(form: Array, z: Array, n: int) -> float:
-    """Return the value of a form for the first n elements of z."""
-    total = 0.0
-    for j in range(n):
-        total += form[j] * z[j]
-    return total
 
 
 TRIALS, TRIAL_FAULT, TRIAL_NOISE = 200, 50.0, 1.5
@@ -221,7 +213,7 @@ def worst(params: SingleFault, verdict: SampleVerdict) -> int:
 @compiled
 def error_of(params: SingleFault, i: int, sample: SampleInput) -> float:
     """Return the error of channel i for a single fault, rad/s: ``z_i - z_ip``."""
-    return value_of(params.errors[i], sample.z, params.sensors.n)
+    return dot(params.errors[i], sample.z, params.sensors.n)
 
 
 @compiled
@@ -250,10 +242,7 @@ def std_of(
     """
     if params.sensors.constant:
         return resting
-    total = 0.0
-    for j in range(params.sensors.n):
-        total += form[j] * form[j] * verdict.error[j]
-    return math.sqrt(total)
+    return math.sqrt(variance_along(form, verdict.error, params.sensors.n))
 
 
 @compiled
@@ -328,7 +317,7 @@ def judge_sums(
     """Judge one sample by the error of the channel with the worst sum of forms."""
     for i in range(params.sensors.n):
         for t in range(params.terms):
-            value = value_of(params.forms[t, i], sample.z, params.sensors.n)
+            value = dot(params.forms[t, i], sample.z, params.sensors.n)
             verdict.scores[i] += value * value if params.squares else abs(value)
     if params.paper:
         named = worst(params, verdict)
