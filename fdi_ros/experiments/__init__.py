@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Monte-Carlo studies of detectors: a class for each kind of trial, a row for each in `PROTOCOLS`."""
+"""Monte-Carlo studies of detectors: a class and a row of `PROTOCOLS` a kind of trial."""
 
 PROTOCOLS = {
     "residual_search": "residual_search:ResidualSearch",
@@ -9,4 +9,4 @@ PROTOCOLS = {
     "delay": "white_noise:Delay",
     "flight": "flight:Flight",
 }
-"""Modules, in this package, and classes of the trial protocols, by the name of their section in a study."""
+"""Module and class of each trial protocol, by the name of its section in a study."""

@@ -32,7 +32,7 @@ from fdi_ros.model.samples import Array, Mask
 
 
 class ChiSquare:
-    """Chi-square test of the whole parity vector, constant noise, which names the channel of the largest ``|w_i|``.
+    """Chi-square test of the parity vector that names the channel of the largest ``|w_i|``.
 
     Not a detector of the monitor: parameters and verdicts as of one, without a memory.
     """
@@ -62,7 +62,7 @@ class ChiSquare:
         )
 
     def detect(self, z: Array) -> Verdict:
-        """Verdicts on samples z (N, n) rad/s: square of the whitened parity vector against its quantile."""
+        """Judge samples z (N, n), rad/s, by the square of the whitened parity vector."""
         square = (_products(z, self._parity) ** 2).cumsum(axis=1)[:, -1]
         scores = np.abs(_products(z, self._normalised))
         alarm = square >= self.threshold
@@ -85,17 +85,20 @@ class ChiSquare:
 
 
 def _products(z: Array, forms: Array) -> Array:
-    """Value of each form (k, n) for each sample (N, n): (N, k), summed in the order of channels on every machine."""
+    """Return the value (N, k) of each form (k, n) for each sample (N, n).
+
+    The sums go in the order of channels, on every machine.
+    """
     return np.asarray((z[:, None, :] * forms).cumsum(axis=2)[:, :, -1])
 
 
 BOUND = 3.0
-"""Guaranteed bound of a channel in a study, in noise_std: what a user who takes 3 sigma for the limit would set."""
+"""Guaranteed bound of a channel in a study, in noise_std: 3 sigma taken for a limit."""
 LOOSE_BOUNDS = (
     0.2  # loose threshold of `guaranteed`, in bounds, from which its own is found
 )
 RANKED_BY_SCORE = ("likelihood_ratio", "cusum")
-"""Methods that rank several suspects by their scores. For others the largest normalised error counts."""
+"""Methods that rank suspects by scores. Others rank by the largest normalised error."""
 
 NORMALISED_SCORES = (
     "likelihood_ratio",
@@ -114,7 +117,7 @@ METHODS: dict[str, Any] = {
 class Evaluation(NamedTuple):
     """Verdicts of one method on N samples at its loose threshold."""
 
-    ratio: Array  # (N,) statistic over threshold: an alarm from the calibrated factor on, NaN without an alarm.
+    ratio: Array  # (N,) statistic over threshold, NaN without an alarm
     suspects: Mask  # (N, n)
     isolated: Mask  # (N,)
     named: NDArray[np.intp]  # (N,) the worst of the suspects; -1 without suspects
@@ -123,7 +126,7 @@ class Evaluation(NamedTuple):
 
 
 class Contender:
-    """One method with a loose threshold. The common false-alarm rate needs a multiple of that threshold."""
+    """One method with a loose threshold, a multiple of which gives the common rate."""
 
     def __init__(self, detector: Method) -> None:
         self.detector = detector
@@ -176,17 +179,17 @@ class Contenders(NamedTuple):
 
 
 def _largest(size: Array) -> NDArray[np.intp]:
-    """Column of the largest value of each row, (N,). Rounding must not decide between parallel channels."""
+    """Return the column of the largest value of each row, (N,), equal within rounding."""
     size = np.nan_to_num(size, nan=-1.0)
     top = size.max(axis=1, keepdims=True)
     return np.round(size / np.where(top > 0, top, 1.0), 9).argmax(axis=1)
 
 
-# One false-alarm rate for all -----------------------------------------------------------------------------------------
+# One false-alarm rate for all ---------------------------------------------------------
 
 
 class Cell(NamedTuple):
-    """Trials on one geometry, with faults of one size or one selection of trials, or without faults."""
+    """Trials on one geometry, of one size of fault or one selection, or without faults."""
 
     geometry: int
     size: float = 0.0
@@ -199,10 +202,10 @@ class Cell(NamedTuple):
 
 
 class CommonRate(TrialProtocol[Cell]):
-    """A protocol that has all methods at one false-alarm rate: that of their loose thresholds, times what it finds.
+    """A protocol that compares all methods at one false-alarm rate.
 
-    The first stage is the same for all: on healthy channels it finds the threshold at which each method gives the rates
-    asked for.
+    The first stage is the same for all: on healthy channels it finds the threshold at
+    which each method gives the rates asked for.
     """
 
     streams: ClassVar[bool] = False  # trials are streams, which all methods can judge
@@ -236,7 +239,7 @@ class CommonRate(TrialProtocol[Cell]):
         return [Cell(g) for g in range(len(self.specs))]
 
     def trials(self, cell: Cell) -> tuple[int, int]:
-        """Return the trials of a cell and of a block, as set. Healthy channels need more than faulty ones."""
+        """Return the trials of a cell and of a block. Healthy channels need more trials."""
         return self.settings[
             "sound_trials" if cell.healthy else "trials"
         ], self.settings["block"]
@@ -262,7 +265,7 @@ class CommonRate(TrialProtocol[Cell]):
         }
 
     def refusals(self) -> Refusals:
-        """Return the methods that do not judge what the trials are of, or do not run on a geometry."""
+        """Return the methods that judge no such trials, or do not run on a geometry."""
         return {
             str(spec): one.refused
             for spec, one in zip(self.specs, self.contenders, strict=True)
@@ -276,12 +279,12 @@ class CommonRate(TrialProtocol[Cell]):
 
     @abstractmethod
     def loose(self) -> tuple[NoiseModel, float]:
-        """Error model of a channel, and the false-alarm probability per sample of the loose thresholds."""
+        """Return the error model of a channel and the loose false-alarm probability."""
 
     def build(
         self, g: int, names: Sequence[str], own: Mapping[str, Mapping[str, Any]]
     ) -> Contenders:
-        """Build methods of `METHODS` at loose thresholds for a geometry. Options by name in ``own`` take precedence."""
+        """Build methods of `METHODS` at loose thresholds. Options in ``own`` take precedence."""
         geometry, (noise, probability) = self.geometries[g], self.loose()
         running, refused, streaming = {}, {}, {}
         for name in names:
@@ -310,7 +313,7 @@ class CommonRate(TrialProtocol[Cell]):
 def factors_of(
     blocks: Sequence[Counts], false_alarms: Sequence[float]
 ) -> dict[str, list[float]]:
-    """Multiple of its loose threshold by method for each false-alarm rate, from blocks of healthy channels.
+    """Return the multiple of each loose threshold for each rate, from healthy channels.
 
     Each has the number of its ``trials``, and by method its ``largest`` ratios.
     """
@@ -328,7 +331,7 @@ def factors_of(
 def threshold_factor(
     largest: Sequence[float], alarm_probability: float, trials: int
 ) -> float:
-    """Ratio that the given share of trials reaches, from their largest ratios, at least the loose threshold, 1."""
+    """Return the ratio that a share of trials reaches, at least 1, the loose threshold."""
     rank = round(alarm_probability * trials)
     ordered = np.sort(np.asarray(largest, dtype=np.float64))[::-1]
     if rank < 1 or rank > len(ordered):
@@ -336,14 +339,15 @@ def threshold_factor(
     return max(float(ordered[rank - 1]), 1.0)
 
 
-# The least delay ----------------------------------------------------------------------------------------------------
+# The least delay ----------------------------------------------------------------------
 
 
 def moustakides_delay(shift: float, run_length: float) -> float:
-    """Least possible worst-case mean delay, samples, at a mean number of samples (``run_length``) to a false alarm.
+    """Return the least possible worst-case mean delay, samples, at a mean run length.
 
-    No method has less than the CUSUM tuned to the very change (Moustakides 1986), for a ``shift`` > 0 of the mean of a
-    standard normal: the fault in standard deviations times sqrt(S_ii).
+    No method has less than the CUSUM tuned to the very change (Moustakides 1986), for a
+    ``shift`` > 0 of the mean of a standard normal: the fault in standard deviations
+    times sqrt(S_ii).
     """
     limit = solve_log(
         lambda limit: cusum_run_length(limit, shift / 2, 0.0),
@@ -354,10 +358,10 @@ def moustakides_delay(shift: float, run_length: float) -> float:
 
 
 def cusum_run_length(limit: float, reference: float, mean: float) -> float:
-    """Mean number of samples until a one-sided CUSUM ``s = max(0, s + x - reference)`` of normal x reaches its limit.
+    """Return the mean samples until a CUSUM ``max(0, s + x - reference)`` has its limit.
 
-    Starts at s = 0. Solves the integral equation of Page (1954) by Gauss-Legendre quadrature, in
-    standard deviations of x.
+    Starts at s = 0. Solves the integral equation of Page (1954) by Gauss-Legendre
+    quadrature, in standard deviations of x.
     """
 
     def above(x: float) -> float:

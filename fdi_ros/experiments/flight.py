@@ -1,13 +1,14 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulated flights: vehicle motion, gyros with the errors of real ones, and trials of the whole monitor on them.
+"""Simulated flights: motion, gyros with real errors, and trials of the whole monitor.
 
 Measurement of channel i at time t, in this order:
 
     z_i(t) = round(clip(h_i . omega(t + delay_i) + bias_i + walk_i(t) + noise_i(t)))
 
-h_i (3,) is the true axis: the nominal one, turned by the misalignment and lengthened by the scale factor.
+h_i (3,) is the true axis: the nominal one, turned by the misalignment and lengthened by
+the scale factor.
 """
 
 from __future__ import annotations
@@ -71,12 +72,12 @@ def vehicle_motion(
     max_rate: float = 2.0,
     max_acceleration: float = 20.0,
 ) -> Motion:
-    """Motion of a small vehicle: a rest at the start, then rests, slow turns and fast manoeuvres as they come.
+    """Draw a motion of a small vehicle: rest, then rests, slow turns and fast manoeuvres.
 
-    The motion ends at rest after about ``duration``, s. The first rest takes ``rest``, s.
-    ``max_rate``: largest rate of a component in a fast manoeuvre, rad/s. Slow turns
-    reach 0.15 of that rate. ``max_acceleration``: largest angular
-    acceleration of a component, rad/s^2.
+    The motion ends at rest after about ``duration``, s. The first rest takes ``rest``,
+    s. ``max_rate``: largest rate of a component in a fast manoeuvre, rad/s. Slow turns
+    reach 0.15 of that rate. ``max_acceleration``: largest angular acceleration of a
+    component, rad/s^2.
     """
     times: list[float] = [0.0, rest]
     rates: list[Array] = [np.zeros(3), np.zeros(3)]
@@ -112,7 +113,7 @@ def _phase(
 
 @dataclass(frozen=True)
 class GyroErrors:
-    """How far gyros of one make differ from ideal ones. The defaults are those of a small MEMS unit."""
+    """Errors of gyros of one make. The defaults are typical of a small MEMS unit."""
 
     noise_std: float = 0.0025  # white noise of one sample, rad/s
     bias_std: float = 0.01  # bias at switch-on, rad/s
@@ -157,7 +158,7 @@ class Gyros:
     def measure(
         self, motion: Motion, stamp: NDArray[np.int64], rng: np.random.Generator
     ) -> Block:
-        """Sample at the given stamps, (N,) ns, strictly increasing. The motion's time is 0 at the first."""
+        """Sample at increasing stamps (N,), ns. The motion begins at the first one."""
         errors = self.errors
         seconds = (stamp - stamp[0]) * 1e-9
         z: Array = np.empty((len(stamp), len(self.axes)))
@@ -181,7 +182,7 @@ def regular_stamps(
     return start + np.round(np.arange(count) * (1e9 / sample_rate)).astype(np.int64)
 
 
-# The trials -----------------------------------------------------------------------------------------------------------
+# The trials ---------------------------------------------------------------------------
 
 NONE = "none"  # the cell in which every channel stays healthy
 DEFAULT_SIZES = {
@@ -202,11 +203,11 @@ class Flown(NamedTuple):
 
 
 class Flight(TrialProtocol[str]):
-    """Kind of fault by method: declared, named rightly, delay, and error of the fused rate, false declarations.
+    """Declarations, names, delays and errors of the fused rate, by method and kind of fault.
 
-    Each trial draws a vehicle's motion, the gyros of one unit with all their errors, one channel and an onset. Every
-    method flies the same flights. The monitor has the settings given by the file, and no knowledge of the rest. A cell
-    is a kind of fault.
+    Each trial draws a vehicle's motion, the gyros of one unit with all their errors,
+    one channel and an onset. Every method flies the same flights. The monitor has the
+    settings given by the file, and no knowledge of the rest. A cell is a kind of fault.
     """
 
     schema: ClassVar[Schema] = {
@@ -257,7 +258,7 @@ class Flight(TrialProtocol[str]):
         }
 
     def summary(self, cell: str, counts: Counts, preparation: Preparation) -> Figures:
-        """Return shares of flights by outcome, delays, and root mean square errors of the fused rate, rad/s."""
+        """Return shares of flights by outcome, delays, and RMS errors of the rate, rad/s."""
         rate = self._config().sample_rate
         methods = {name: _figures(own, rate) for name, own in counts["methods"].items()}
         return {"fault": cell, "trials": counts["trials"], "methods": methods}
@@ -335,13 +336,14 @@ class Flight(TrialProtocol[str]):
 
 
 def _counted(monitor: Pipeline, flights: Sequence[Flown]) -> Counts:
-    """Run the monitor over flights, and count what came of them.
+    """Run the monitor over flights, and count the outcomes.
 
-    ``right``: the faulty channel is isolated, and no other. ``wrong``: a healthy one is isolated.
-    ``ambiguous``: the faulty one is in an ambiguity group, and never isolated.
-    ``silent``: none of these. ``without_rate``: samples from the onset on
-    without a fused rate. ``delays``: flights by samples from the onset to the isolation. ``after`` and ``before`` the
-    onset: sum of the squared errors of the fused rate, (rad/s)^2, over so many samples.
+    ``right``: the faulty channel is isolated, and no other. ``wrong``: a healthy one is
+    isolated. ``ambiguous``: the faulty one is in an ambiguity group, and never
+    isolated. ``silent``: neither. ``without_rate``: samples from the onset on
+    without a fused rate. ``delays``: flights by samples from the onset to the
+    isolation. ``after`` and ``before`` the onset: sum of the squared errors of the
+    fused rate, (rad/s)^2, over as many samples.
     """
     outcomes: Counter[OutcomeKind] = Counter()
     delays: Counter[str] = Counter()

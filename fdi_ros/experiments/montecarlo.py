@@ -1,12 +1,14 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Monte-Carlo studies: the same trials for every method, the same figures for the same seed on any worker.
+"""Monte-Carlo studies: the same trials for every method, reproducible on any worker.
 
-A study file holds ``title``, ``seed`` and one or more sections. The name of a section says what kind of trial it runs
-(`fdi_ros.experiments.PROTOCOLS`), its keys are that kind's settings. A protocol has cells of equal settings, which are
-cut into blocks that any worker can run. What blocks give, what the first stage finds and the figures of a cell are
-mappings by name, as the JSON has them: they go between processes and into the result as they are.
+A study file holds ``title``, ``seed`` and one or more sections. The name of a section
+says what kind of trial it runs (`fdi_ros.experiments.PROTOCOLS`), its keys are that
+kind's settings. A protocol has cells of equal settings, which are cut into blocks that
+any worker can run. What blocks give, what the first stage finds and the figures of a
+cell are mappings by name, as the JSON has them: they go between processes and into the
+result as they are.
 """
 
 from __future__ import annotations
@@ -35,14 +37,14 @@ from fdi_ros.replay.outcomes import added
 from fdi_ros.system.jobs import run_jobs, worker_count
 from fdi_ros.system.yaml_file import read_yaml
 
-# What a trial protocol is ---------------------------------------------------------------------------------------------
+# What a trial protocol is -------------------------------------------------------------
 
 Schema = Mapping[str, Field]
-"""Settings of a section by name. Besides the kinds of `Field`: detectors, geometry, geometries, mapping."""
+"""Settings of a section by name, also of detectors, geometries and mappings."""
 Cell = TypeVar("Cell")  # what distinguishes one cell of a section from the others
 Counts = dict[
     str, Any
-]  # what trials gave: numbers, None, and lists or mappings by text of these
+]  # results of trials: numbers, None, and lists or mappings of numbers
 Preparation = dict[
     str, Any
 ]  # results of the first stage, under ``found`` in the result
@@ -57,8 +59,9 @@ Refusals = Mapping[
 class TrialProtocol(ABC, Generic[Cell]):
     """One section of a study, with settings checked against `schema`.
 
-    The first stage finds thresholds on healthy channels and whatever else trials need. The second runs the trials. A
-    block's result depends on its settings, its seed and the first stage alone.
+    The first stage finds thresholds on healthy channels and whatever else trials need.
+    The second runs the trials. A block's result depends on its settings, its seed and
+    the first stage alone.
     """
 
     schema: ClassVar[Schema]
@@ -75,11 +78,11 @@ class TrialProtocol(ABC, Generic[Cell]):
         """Cells of the second stage."""
 
     def trials(self, cell: Cell) -> tuple[int, int]:
-        """Trials of a cell, and of one block of it, as set: the block size never depends on the workers."""
+        """Return the trials of a cell and of a block, whatever the number of workers."""
         return self.settings["trials"], self.settings["block"]
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
-        """Run one block of the first stage, where there is one."""
+        """Run one block of the first stage, if the protocol has one."""
         return {}
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
@@ -112,7 +115,7 @@ def protocol_class(kind: str) -> type[AnyProtocol]:
     return found
 
 
-# Study files ----------------------------------------------------------------------------------------------------------
+# Study files --------------------------------------------------------------------------
 
 NAMED_GEOMETRIES: dict[str, Callable[[], Geometry]] = {
     "two_triad_cone": Geometry.two_triad_cone,
@@ -144,7 +147,7 @@ class Study:
 def load_study(
     path: str | Path, trials: int | None = None, seed: int | None = None
 ) -> Study:
-    """Read a study file. Given trials and seed take precedence. Raise `StudyError` if the file is missing or wrong."""
+    """Read a study file. Trials and seed given take precedence. Raise `StudyError`."""
     raw = read_yaml(path, "study", StudyError)
     if not isinstance(raw, dict):
         raise StudyError(
@@ -203,7 +206,7 @@ def section_settings(kind: str, raw: Any, schema: Schema) -> dict[str, Any]:
 
 
 def checked(section: str, name: str, field: Field, value: Any) -> Any:
-    """Value of one setting, of its type and within its range (else `StudyError`), as plain values for JSON."""
+    """Return one setting as JSON values. Raise `StudyError` for a wrong type or range."""
     where = f"{section}.{name}"
     if field.kind == "detectors":
         named = replace(field, kind="texts", choices=field.choices or tuple(DETECTORS))
@@ -253,7 +256,7 @@ def geometry_of(spec: Any) -> Geometry:
     return Geometry.cone(int(spec.removeprefix("cone_")))
 
 
-# Running one ----------------------------------------------------------------------------------------------------------
+# Running one --------------------------------------------------------------------------
 
 PREPARING, TRIALS = (
     0,
@@ -298,8 +301,8 @@ def run_block(
 ) -> Counts:
     """Run one block of trials, wherever: the result depends on the arguments alone.
 
-    Settings and preparation come as JSON: detectors are built once per process for each. The block's own generator is
-    spawned from the seed of the study.
+    Settings and preparation come as JSON: detectors are built once per process for
+    each. The block's own generator is spawned from the seed of the study.
     """
     protocol, prepared = _built(kind, settings, preparation)
     rng = np.random.default_rng(
@@ -335,9 +338,10 @@ def run_study(
 ) -> StudyResult:
     """Run a study and return all figures and settings.
 
-    ``workers``: local processes, by default one per core. The figures do not depend on their number. ``cluster``:
-    address of the scheduler of a Dask cluster that works instead. ``progress`` is called with the share done.
-    `StudyError` if the study cannot be run.
+    ``workers``: local processes, by default one per core. The figures do not depend on
+    their number. ``cluster``: address of the scheduler of a Dask cluster that works
+    instead. ``progress`` is called with the share done. `StudyError` if the study
+    cannot be run.
     """
     protocols = [protocol_class(one.kind)(one.settings) for one in study.sections]
 

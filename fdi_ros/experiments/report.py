@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A study's result for people: tables for terminal, page and documents, and the page with its curves."""
+"""A study's result for people: tables, and the page with its curves."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _shown(result: StudyResult, how: Mapping[str, Shows]) -> list[Section]:
 
 
 def tables(result: StudyResult) -> list[Section]:
-    """All tables of a result, in the order of its sections. Detectors of equal figures share a row."""
+    """Return all tables of a result by section. Detectors of equal figures share a row."""
     return _shown(result, _TABLES)
 
 
@@ -358,7 +358,7 @@ def _flight(group: Group) -> list[Section]:
 
 
 def _search(group: Group) -> list[Section]:
-    """Shares of each selection: of the searches with the paper's tolerance, then of all methods at each rate."""
+    """Return shares by selection: of the paper's searches, then of all methods by rate."""
     found, settings = [], group.settings
     for cell in group.cells:
         rows = [

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The Monte-Carlo protocol of Gorelov, Zbrutskyi, Shcholieva, Yankelevych 2019, with every method beside its four.
+"""The Monte-Carlo protocol of Gorelov et al. 2019, with every method beside its four.
 
 ``z_i = (H omega)_i (1 + k_i) + b_i``, omega uniform in a cube, k and b of healthy channels normal and clipped at
 3 standard deviations. One channel, any, has ``k = sign(X1) ((D - 3) |X1| + 3) sigma_k`` and b alike, X uniform on
@@ -38,10 +38,10 @@ names within the tolerance too."""
 
 
 class ResidualSearch(CommonRate):
-    """Outcomes of the protocol: right or wrong channel, declared or within the tolerance, and false alarms.
+    """Outcomes: right or wrong channel, declared or within the tolerance; false alarms.
 
-    The four searches with the paper's tolerance. Then all methods at common false-alarm rates of healthy channels. A
-    cell is a selection of trials, or healthy channels.
+    The four searches with the paper's tolerance. Then all methods at common false-alarm
+    rates of healthy channels. A cell is a selection of trials, or healthy channels.
     """
 
     schema: ClassVar[Schema] = {
@@ -147,7 +147,7 @@ class ResidualSearch(CommonRate):
     def draw(
         self, cell: Cell, count: int, rng: np.random.Generator
     ) -> tuple[Array, Index | None]:
-        """Draw trials and keep those of a selection: z (N, n) rad/s, and the failed channel (N,), or None."""
+        """Draw trials of a selection: z (N, n), rad/s, and the failed channel (N,) or None."""
         n = self.geometries[0].n
         omega = rng.uniform(-1, 1, (count, 3)) * self.settings["max_rate"]
         scale, zero = np.clip(rng.standard_normal((2, count, n)), -CLIP, CLIP)
@@ -188,7 +188,7 @@ def _selected(size: Array, failed: Index, selection: str) -> NDArray[np.bool_]:
 
 
 def _counted(declared: NDArray[np.bool_], named: Index, failed: Index | None) -> Counts:
-    """Trials by outcome: declared, of healthy channels, or right or wrong name, declared or within the tolerance."""
+    """Count trials by outcome."""
     if failed is None:
         return {"declared": int(declared.sum())}
     right = named == failed

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Trials in white noise of equal channels: of one sample each, and of a stream each until the alarm."""
+"""Trials in white noise of equal channels: single samples, and streams to the alarm."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.replay.outcomes import Z95, Estimate, mean_of, quantiles, share
 
-# One sample -----------------------------------------------------------------------------------------------------------
+# One sample ---------------------------------------------------------------------------
 
 FOUND, DERIVED = "found", "derived"
-"""Thresholds: found by the first stage on healthy channels, or as each method derives it from the false-alarm rate."""
+"""Thresholds: found on healthy channels, or derived by each method from the rate."""
 FALSE_ALARM_MARGIN = (
     4.0  # the loose thresholds have this many times the false-alarm rate asked for
 )
 
 
 class Snapshot(CommonRate):
-    """Detection, right isolation and suspects by size of fault: none, one or two channels off by some noise_std."""
+    """Detection, right isolation and suspects, by the size of no, one or two faults."""
 
     schema: ClassVar[Schema] = {
         **CommonRate.schema,
@@ -99,7 +99,7 @@ class Snapshot(CommonRate):
         return {"trials": count, "methods": methods}
 
     def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
-        """Return shares of samples declared, rightly named, isolated and covered, at each false-alarm rate."""
+        """Return shares declared, rightly named, isolated and covered, at each rate."""
         alarms = self.settings["false_alarms"]
         return {
             "geometry": self.specs[cell.geometry],
@@ -121,7 +121,7 @@ class Snapshot(CommonRate):
     def _at_rates(
         self, g: int, factors: Mapping[str, Sequence[float]]
     ) -> dict[str, list[tuple[Contender, float]]]:
-        """Each method with the factor of each false-alarm rate, built anew if it depends on its threshold."""
+        """Return each method with the factor of each rate, built anew where it must be."""
         if g not in self._ready:
             self._ready[g] = {}
             for name, loose in self.contenders[g].running.items():
@@ -162,11 +162,14 @@ def _noise(noise_std: float) -> NoiseModel:
 
 
 def counted(evaluation: Evaluation, factor: float, struck: Mask) -> Counts:
-    """Count the outcomes of samples with faults in the channels struck (N, n). Without faults count false alarms.
+    """Count the outcomes of samples with faults in the channels struck (N, n).
 
-    ``identified``: the largest normalised residual is a faulty channel's, or None without residuals. ``right``:
-    declared, and the channel named first is faulty. ``covered``: declared, and every faulty channel is a suspect.
-    ``set_sizes``: samples by number of suspects, 0 to n.
+    Without faults, count false alarms.
+
+    ``identified``: the largest normalised residual is a faulty channel's, or None
+    without residuals. ``right``: declared, and the channel named first is faulty.
+    ``covered``: declared, and every faulty channel is a suspect. ``set_sizes``: samples
+    by number of suspects, 0 to n.
     """
     declared = evaluation.ratio >= factor
     rows = np.arange(len(struck))
@@ -191,7 +194,7 @@ def counted(evaluation: Evaluation, factor: float, struck: Mask) -> Counts:
 
 
 def _shares(false_alarm: float, counts: Counts) -> Figures:
-    """Shares of the samples at one false-alarm rate, without those that the method does not give."""
+    """Return shares of the samples at one rate, without those the method has not."""
     trials, identified = counts["trials"], counts["identified"]
     wrong = counts["isolated"] - counts["isolated_right"]
     return {
@@ -207,18 +210,19 @@ def _shares(false_alarm: float, counts: Counts) -> Figures:
     }
 
 
-# A stream -------------------------------------------------------------------------------------------------------------
+# A stream -----------------------------------------------------------------------------
 
-RUN_LENGTH_MARGIN = 3.0  # the loose thresholds have a run length this many times shorter than the one asked for
+RUN_LENGTH_MARGIN = 3.0  # ratio of the run length asked for to the loose one
 WINDOW_SHARE = 10  # a window of healthy samples is the run length over this
 
 
 class Delay(CommonRate):
-    """Delay against size of fault at one mean run length to a false alarm, beside the least possible delay.
+    """Delay by size of fault at one mean run length, beside the least possible delay.
 
-    The first stage finds the threshold at which a method gives no alarm over a window of W healthy samples with the
-    probability exp(-W / run length). In the second, each stream begins with `lead` healthy samples, so that memories
-    are filled. Streams with an alarm among them are counted and left out.
+    The first stage finds the threshold at which a method gives no alarm over a window
+    of W healthy samples with the probability exp(-W / run length). In the second, each
+    stream begins with `lead` healthy samples, so that memories are filled. Streams with
+    an alarm among them are counted and left out.
     """
 
     streams = True
@@ -261,7 +265,7 @@ class Delay(CommonRate):
         }
 
     def conclude(self, found: Sequence[Sequence[Counts]]) -> Preparation:
-        """Find the multiples of the loose thresholds by geometry and method, for the common run length."""
+        """Find the multiples of the loose thresholds for the common run length."""
         with_alarm = -math.expm1(-self._window / self.settings["run_length"])
         factors = [factors_of(blocks, [with_alarm]) for blocks in found]
         return {
@@ -307,7 +311,7 @@ class Delay(CommonRate):
     def draw(
         self, cell: Cell, count: int, rng: np.random.Generator
     ) -> tuple[Array, None]:
-        """Draw streams (count, length, n) rad/s: windows of healthy samples, or with a fault after the lead."""
+        """Draw streams (count, length, n), rad/s, healthy or with a fault after the lead."""
         n, lead, sigma = (
             self.geometries[cell.geometry].n,
             self.settings["lead"],
@@ -339,11 +343,11 @@ def _ratios(contender: Contender, z: Array) -> Array:
 
 
 def _delays(alarm: NDArray[np.bool_], lead: int) -> Counts:
-    """Count delays, in samples with the first faulty one as 1, of streams whose fault begins at `lead`.
+    """Count delays of streams whose fault begins at `lead`, whose first sample counts 1.
 
-    Streams with an alarm before the fault, which are left out of all else, with one after it, and without. ``waited``:
-    samples until the alarm, or the end, of all streams. ``squares``: sum of the squared delays. ``histogram``: streams
-    by delay.
+    Streams with an alarm before the fault, which are left out of all else, with one
+    after it, and without. ``waited``: samples until the alarm, or the end, of all
+    streams. ``squares``: sum of the squared delays. ``histogram``: streams by delay.
     """
     early = alarm[:, :lead].any(axis=1)
     after = alarm[~early, lead:]
@@ -361,7 +365,7 @@ def _delays(alarm: NDArray[np.bool_], lead: int) -> Counts:
 
 
 def _waited(counts: Counts, memory: bool) -> Figures:
-    """Mean delay: of a method without memory from all the samples waited, alarm or not, for it is geometric there.
+    """Return the mean delay, which is geometric for a method without memory.
 
     None: not known, as some streams ended before the alarm.
     """
