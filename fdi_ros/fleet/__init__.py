@@ -1,4 +1,4 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Many recordings judged by one pipeline: a dataset of flights and events, and a page of what to look at."""
+"""Replays of many recordings: tables of flights and episodes, and a page of flights that need attention."""

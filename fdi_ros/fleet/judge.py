@@ -1,9 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The recordings of a fleet, found in folders, and judged as in a replay, in one process or many.
+"""Finds the recordings of a fleet and judges them as a replay does, in one process or many.
 
-Of each there is a row, and rows of its episodes.
+Each recording has a row of its own, and one row per episode.
 """
 
 from __future__ import annotations
@@ -51,11 +51,20 @@ from fdi_ros.system.text import date_of, shown, storable
 
 
 def find_recordings(given: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """Find all recordings in what is given: each a recording, or a folder, of which all below count, behind links too.
+    """Find all recordings in some paths.
 
-    A file of a rosbag2 folder stands for the folder. Returned are the recordings in order, each once; and what could
-    not be searched, or is called like a recording and is none. `BagError` if something given is not there, or nothing
-    is found at all.
+    A folder counts with all recordings below, links included. A file of a rosbag2 folder stands for
+    its folder.
+
+    Returns
+    -------
+    The recordings in order, each once. The places that could not be searched, and files that are
+    named like a recording but are none.
+
+    Raises
+    ------
+    BagError
+        If a path does not exist, or no recording is found.
     """
     found: dict[str, Path] = {}
     unread: list[str] = []
@@ -76,7 +85,7 @@ def find_recordings(given: Sequence[str]) -> tuple[list[Path], list[str]]:
 
 
 def _below(folder: Path, unread: list[str]) -> Iterator[Path]:
-    """Yield the recordings in a folder and below, each folder once: links may lead in circles."""
+    """Yield the recordings in a folder and below. Links may form circles, so each folder counts once."""
     walked = set[str]()
 
     def note(error: OSError) -> None:
@@ -93,7 +102,7 @@ def _below(folder: Path, unread: list[str]) -> Iterator[Path]:
         if bag is not None:
             yield here
         for path in (here / name for name in sorted(files)):
-            # What else lies in the folder of a bag is a part of it, but for logs.
+            # Other files in the folder of a bag belong to the bag, except logs.
             if (
                 bag is None or path.name.lower().endswith(LOG_SUFFIXES)
             ) and _is_recording(path, unread):
@@ -101,13 +110,13 @@ def _below(folder: Path, unread: list[str]) -> Iterator[Path]:
 
 
 def _is_recording(path: Path, unread: list[str]) -> bool:
-    """Whether a file is a recording; what is only called so is noted."""
+    """Whether a file is a recording. A file that is only named like one is added to ``unread``."""
     name, suffix = path.name.lower(), path.suffix.lower()
     if not name.endswith((*SUFFIXES, *LOG_SUFFIXES)) or not path.is_file():
         return False
     if not name.endswith(LOG_SUFFIXES):
         return True
-    # Firmware and much else is called .bin, too, and any table .csv.
+    # Firmware is called .bin, too, and any table .csv.
     magic = FORMATS[suffix].magic
     try:
         with open_regular(path) as file:
@@ -115,23 +124,25 @@ def _is_recording(path: Path, unread: list[str]) -> bool:
                 return has_gyros(file)
             begin = file.read(len(LFS))
     except OSError:
-        # Reading it says what is wrong.
+        # Reading the file will report the error.
         return True
-    # An empty log is a log that was lost; so is one that git has put elsewhere.
+    # An empty log was lost, and a pointer of git-lfs is no log.
     known = not begin or begin.startswith((magic, LFS))
     unread += [] if known else [f"{path} is no flight log"]
     return known
 
 
-# Judged ---------------------------------------------------------------------------------------------------------------
+# Judging
 
 
-DEFAULT_SYSTEM = 1  # MAVLink system of an autopilot that nobody gave another number
-CALIBRATED = 1_000_000  # samples that a calibration takes at most: the first ones of a long flight
+DEFAULT_SYSTEM = 1
+"""Default MAVLink system of an autopilot."""
+CALIBRATED = 1_000_000
+"""Largest number of samples of a calibration, the first ones of a long flight."""
 
 
 Judged = tuple[Flight, Sequence[FlightEpisode], str]
-"""What came of one recording: its rows, and the text of the parameter file that it was judged with, empty if none."""
+"""Result for one recording: its rows, and the text of its parameter file. Empty: no file."""
 
 
 def judge_all(
@@ -144,38 +155,38 @@ def judge_all(
     show: Callable[[float], object],
     reports: Path | None = None,
 ) -> None:
-    """Judge the recordings that are not in the tables as they are now, and write the tables.
+    """Judge the recordings that are new or have changed, and write the tables.
 
     Parameters
     ----------
     paths
         The recordings.
     parameters
-        Text of a parameter file; empty: what ``fdi inspect`` writes for each recording.
+        Text of a parameter file. Empty: the config that ``fdi inspect`` writes for each recording.
     calibrated
         Whether each recording is calibrated on itself.
     tables
-        The tables, which take the rows.
+        The tables for the rows.
     workers, cluster
-        As of `run_jobs`.
+        As for `run_jobs`.
     show
         Called with the share done.
     reports
-        Folder for a page of each recording; None: no pages.
+        Folder for a page of each recording. None: no pages.
 
     Raises
     ------
     FdiError
-        If nothing can be written, or the cluster is lost.
+        If the tables cannot be written, or the cluster is lost.
     """
     jobs = []
     for path in paths:
-        # The last name of a folder alone may be shared: drone_1/logs and drone_2/logs are not one vehicle.
+        # The whole path identifies a vehicle: drone_1/logs and drone_2/logs are two.
         flight = Flight(
             storable(str(path)), storable(str(path.parent)), digest_of(path)
         )
         row = tables.flights.get(flight.path)
-        # What could not be judged is tried again: it may be mended.
+        # A recording with an error is tried again, because it may be repaired.
         if row is not None and _is_done(row, flight.digest, reports):
             continue
         jobs.append((path, flight, parameters, calibrated, reports))
@@ -196,16 +207,16 @@ def judge_all(
 
 
 def _is_done(row: Row, digest: str, reports: Path | None) -> bool:
-    """Whether a recording was judged as it is now, and its page is there if pages are asked for."""
+    """Whether a recording was judged in its present form, with its page if pages are wanted."""
     if row["digest"] != digest or row["error"]:
         return False
     return reports is None or (reports.parent / row["report"]).is_file()
 
 
 def digest_of(path: Path) -> str:
-    """Tell a recording as it is now from itself after a change, without reading it."""
+    """Return a digest of names, sizes and times, which shows a change without reading the files."""
     stats: list[tuple[str, int, int]] = []
-    # Reading it says what is wrong.
+    # Reading the recording will report the error.
     with suppress(BagError, OSError):
         for file in (*find_files(path, Damage()), *path.glob("metadata.yaml")):
             about = file.stat()
@@ -224,7 +235,7 @@ def judge(
 ) -> Judged:
     """Judge one recording, and write its page into a folder of reports.
 
-    ``flight``: what of its row is known before. An error goes into the row.
+    ``flight``: known part of its row. An error becomes part of the row.
     """
     try:
         return _judged(path, flight, parameters, calibrated, reports)
@@ -302,7 +313,7 @@ def _calibrated(path: Path, parameters: str) -> str:
 
 
 class _Seen(Sink):
-    """Collects what a summary does not have: noise of the channels, and identity of the vehicle."""
+    """Collects noise of the channels and identity of the vehicle, which a summary lacks."""
 
     def __init__(self, config: Config) -> None:
         self._rate, self.segments = (
@@ -310,12 +321,12 @@ class _Seen(Sink):
             NoiseSegments(build_geometry(config).n),
         )
         self.hardware_id = ""
-        """Serial number of the board of the autopilot, empty if the log has none."""
+        """Serial number of the autopilot's board. Empty: not in the log."""
         self.system: int | None = None
-        """MAVLink system of the autopilot, None if the log has none."""
+        """MAVLink system of the autopilot. None: not in the log."""
 
     def begin(self, samples: Samples) -> None:
-        """Note which vehicle recorded it."""
+        """Store the identity of the vehicle."""
         self.hardware_id = storable(shown(samples.recording.hardware_id))
         self.system = samples.recording.system
 
@@ -325,14 +336,14 @@ class _Seen(Sink):
 
 
 def _row(known: Flight, summary: Summary) -> Flight:
-    """Return the row of a recording that was judged."""
+    """Return the row of a judged recording."""
     monitor, stream, declared = summary.monitor, summary.stream, summary.story.declared
-    # What hides for a while, and comes back as it was, is declared once.
+    # A declared channel that was silent for a while is declared once.
     steps = [step for one in declared for step in one.steps]
     found = summary.verdict
     why: list[str] = []
     if found.severity is not Severity.GOOD:
-        # A verdict lists the first concerns only, and none beside a fault.
+        # A verdict lists only the first concerns, and none beside a fault.
         rest = [str(one) for one in summary.concerns if str(one) not in found.sentence]
         why = [found.sentence, *(f"{words}." for words in rest)]
     return replace(
@@ -355,7 +366,7 @@ def _row(known: Flight, summary: Summary) -> Flight:
 
 
 def _episode_row(flight: Flight, one: Episode, origin: int) -> FlightEpisode:
-    """Return the row of an episode; `origin`: what its times count from, ns."""
+    """Return the row of an episode. ``origin``: stamp of time zero, ns."""
     sizes = [
         each.size
         for each in ([one.apart] if one.apart is not None else one.candidates)
@@ -379,6 +390,6 @@ def _episode_row(flight: Flight, one: Episode, origin: int) -> FlightEpisode:
 
 
 def _date(stamp: int) -> str | None:
-    """Return the date of a stamp, ns, UTC; None: it counts from a start."""
+    """Return the date of a stamp, ns, UTC. None: stamps count from a start."""
     date = date_of(stamp)
     return None if date is None else f"{date:%Y-%m-%dT%H:%M:%SZ}"

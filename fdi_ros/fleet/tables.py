@@ -1,9 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The tables of a fleet, a row per recording and a row per episode, as Parquet files, and its page.
+"""The tables of a fleet as Parquet files, one row per recording and one per episode, and its page.
 
-The fields are the columns. What a column holds and its unit stand at the field, and go into the schema of the files.
+The fields are the columns. Their meaning and unit go into the schema of the files.
 """
 
 from __future__ import annotations
@@ -40,12 +40,13 @@ from fdi_ros.report.layout import (
 from fdi_ros.system.files import open_regular, plain, whole, write_text
 from fdi_ros.system.text import LINE, shown, storable
 
-Row = Mapping[
-    str, Any
-]  # values of a row by the names of the columns; None where nothing can be said.
-VERSION = 5  # of the columns: raised when one changes its name, type or meaning
+Row = Mapping[str, Any]
+"""Values of a row by the names of the columns. None: unknown."""
+VERSION = 5
+"""Version of the columns, raised if one changes its name, type or meaning."""
 WRITE_AFTER, WRITE_SHARE = 5.0, 0.05
-"""The tables are written after so many seconds, and in that share of the time: a run that is killed loses no more."""
+"""Time between writes of the tables, s, and largest share of the time for writing. A killed run
+loses the rows since the last write."""
 
 
 def _column(meaning: str, unit: str = "", default: Any = None) -> Any:
@@ -54,95 +55,103 @@ def _column(meaning: str, unit: str = "", default: Any = None) -> Any:
 
 @dataclass(frozen=True)
 class Flight:
-    """One recording as it was judged."""
+    """One judged recording."""
 
-    path: str = _column("where the recording lies, whole path")
+    path: str = _column("path of the recording")
     vehicle: str = _column(
-        "serial number of the autopilot's board where the log has one; else the folder in"
-        " which it lies, whole path, with the MAVLink system unless that is 1"
+        "serial number of the autopilot's board if the log has one; else the path of the"
+        " folder, with the MAVLink system unless that is 1"
     )
     digest: str = _column(
-        "names, sizes and times of its files, hashed: with another one it is judged again"
+        "hash of names, sizes and times of the files; after a change it is judged again"
     )
-    error: str = _column("why it could not be judged; empty if it was", default="")
+    error: str = _column("why it could not be judged; empty: it was judged", default="")
     why: tuple[str, ...] = _column(
-        "why a person should look at it; empty: there is no need", default=()
+        "why the flight needs attention; empty: it does not", default=()
     )
-    config: str = _column("parameter file it was judged with", default="")
+    config: str = _column("parameter file of the replay", default="")
     report: str = _column(
         "page of its replay, below the folder of the tables; empty: not written",
         default="",
     )
     calibration: str = _column(
-        "'on itself', or why it could not be calibrated; empty: not asked", default=""
+        "'on itself', or why it could not be calibrated; empty: not wanted", default=""
     )
     measured: bool | None = _column(
-        "false: mounts and axes are what fdi inspect assumes, not measured"
+        "whether mounts and axes were measured; false: assumed as by fdi inspect"
     )
     date: str | None = _column(
-        "of the first sample, UTC; null: its stamps count from a start, as of a log without GPS"
+        "date of the first sample, UTC; null: stamps count from a start, as in a log without GPS"
     )
     duration: float | None = _column("from the first sample to the last", "s")
-    damage: tuple[str, ...] | None = _column("what of it could not be read")
-    watched: float | None = _column(
-        "time that was judged while nothing stood declared", "s"
-    )
+    damage: tuple[str, ...] | None = _column("parts that could not be read")
+    watched: float | None = _column("judged time without a standing declaration", "s")
     episodes: int | None = _column(
         "faults declared, each from its first declaration to its end"
     )
     declared: int | None = _column(
-        "declarations: a channel faulty, or a set one of which is"
+        "declarations of a faulty channel, or of a set that contains one"
     )
-    sets: int | None = _column("of these, sets of several channels")
-    degraded: tuple[str, ...] | None = _column(
-        "what became worse than it should be without being declared"
-    )
+    sets: int | None = _column("declarations of sets of several channels")
+    degraded: tuple[str, ...] | None = _column("degradations without a declaration")
     channels: tuple[str, ...] | None = _column(
         "names of the channels; the next three are in their order"
     )
     unchecked: tuple[float, ...] | None = _column(
-        "share of the samples in which nothing checked the channel, or it gave none"
+        "share of the samples in which the channel was unchecked or missing"
     )
     noise: tuple[float, ...] | None = _column(
-        "noise of each gyro per sample, at the quietest; gyros come first", "rad/s"
+        "lowest noise of each gyro in one sample; gyros come first", "rad/s"
     )
     bias: tuple[float, ...] | None = _column(
-        "bias of each at the end: given, learned and followed",
+        "bias of each channel at the end, the configured bias included",
         "rad/s; m/s^2 of accelerometers",
     )
 
 
 @dataclass(frozen=True)
 class FlightEpisode:
-    """One episode of one flight: a fault as the monitor declared it, or channels that gave nothing."""
+    """One episode of a flight: a declared fault, or channels without data."""
 
-    path: str = _column("where the recording lies, whole path")
-    vehicle: str = _column("as of its flight")
-    date: str | None = _column("of its start, UTC; null: the flight has no date")
-    state: str = _column("what it came to: FAULTY, AMBIGUOUS or STALE")
+    path: str = _column("path of the recording")
+    vehicle: str = _column("vehicle of the flight")
+    date: str | None = _column("date of its start, UTC; null: the flight has no date")
+    state: str = _column("last state: FAULTY, AMBIGUOUS or STALE")
     declares: bool = _column(
-        "whether a fault was declared; otherwise channels only gave nothing"
+        "whether a fault was declared; false: channels without data only"
     )
     channels: tuple[str, ...] = _column(
-        "which are, or of which one is where it is AMBIGUOUS"
+        "channels in that state; if AMBIGUOUS, one of them is faulty"
     )
-    start: float = _column("first declaration, from the first message", "s")
-    end: float = _column("when nothing of it stood any more, or its stretch ended", "s")
+    start: float = _column("time of the first declaration, from the first message", "s")
+    end: float = _column("time of the last withdrawal, or end of the stretch", "s")
     size: float | None = _column(
-        "error by the others; between channels of one axis, how far apart",
+        "error measured by the other channels; for two channels on one axis, their difference",
         "as in measured_in",
     )
-    size_std: float | None = _column("standard error of that", "as in measured_in")
+    size_std: float | None = _column("standard error of the size", "as in measured_in")
     measured_in: str = _column("unit of the error: rad/s, or m/s^2 of accelerometers")
-    words: str = _column("all in one sentence")
+    words: str = _column("the episode in one sentence")
 
 
 class Tables:
-    """The folder of a fleet, made if it is not there: its rows as they are there, and as they come.
+    """The folder of a fleet with its rows. The folder is made if it does not exist.
 
-    Rows of recordings that are not given again stay. ``settings``: what decides the results, ready for JSON; rows of
-    other settings are of no use, and with ``force`` it is begun anew where they are there. `BagError` if the tables
-    there are not of a fleet, or of other settings, or another run writes to the folder.
+    Rows of recordings that are not given again stay.
+
+    Parameters
+    ----------
+    folder
+        Path of the folder.
+    settings
+        Settings that decide the results, ready for JSON.
+    force
+        Discard rows of other settings.
+
+    Raises
+    ------
+    BagError
+        If the tables belong to something else or to other settings, or another run writes there.
     """
 
     def __init__(self, folder: Path, settings: Row, force: bool = False) -> None:
@@ -154,7 +163,7 @@ class Tables:
         try:
             (folder / "configs").mkdir(parents=True, exist_ok=True)
             flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
-            # Held as long as this.
+            # The lock is held as long as this object exists.
             self._lock = os.fdopen(os.open(folder / ".lock", flags, 0o666), "rb")
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -171,24 +180,22 @@ class Tables:
         except (BagError, OSError):
             self.give_up()
             raise
-        self.flights: dict[str, Row] = {
-            row["path"]: row for row in flights
-        }  # rows by path
+        self.flights: dict[str, Row] = {row["path"]: row for row in flights}
         self._episodes: dict[str, list[Row]] = {path: [] for path in self.flights}
         for row in episodes:
-            # Those whose flight was not written any more are of no use: it is judged again.
+            # Episodes without a flight are dropped, because the flight is judged again.
             self._episodes.get(row["path"], []).append(row)
         self._written, self._took = time.monotonic(), 0.0
 
     def give_up(self) -> None:
-        """Remove what was made for a run that is refused; a folder that holds anything stays."""
+        """Remove the files of a refused run. A folder with other content stays."""
         with suppress(OSError):
             (self._folder / ".lock").unlink()
             (self._folder / "configs").rmdir()
             self._folder.rmdir()
 
     def add(self, flight: Flight, episodes: Sequence[FlightEpisode]) -> None:
-        """Take the rows of one more recording, with texts in Unicode, in place of its former ones."""
+        """Add the rows of a recording in place of its earlier ones, with texts in Unicode."""
         self.flights[flight.path], self._episodes[flight.path] = (
             plain(flight),
             list(map(plain, episodes)),
@@ -199,7 +206,7 @@ class Tables:
             self.write()
 
     def write(self) -> None:
-        """Write the tables, sorted by path: episodes first, so that every flight that is there has its own."""
+        """Write the tables, sorted by path. Episodes come first, so that no flight lacks its own."""
         begun, paths = time.monotonic(), sorted(self.flights)
         self._save(
             "episodes",
@@ -211,7 +218,7 @@ class Tables:
         self._took = self._written - begun
 
     def keep_config(self, text: str) -> str:
-        """Keep a parameter file; return where it lies."""
+        """Store a parameter file and return its path."""
         path = (
             self._folder
             / "configs"
@@ -226,7 +233,7 @@ class Tables:
         if not path.exists():
             return []
         try:
-            # Opened here: the name may be no Unicode.
+            # Python opens the file, because its name may be no Unicode.
             with open_regular(path) as file:
                 table = parquet.read_table(file)
         except arrow.ArrowException as error:
@@ -258,7 +265,7 @@ class Tables:
         types |= {
             f"tuple[{name}, ...]": arrow.list_(kind) for name, kind in types.items()
         }
-        # As annotated: of what may be unknown, None too.
+        # Annotations with None become nullable columns.
         kinds = [
             (one, types[str(one.type).replace(" | None", "")])
             for one in fields(columns)
@@ -280,11 +287,13 @@ class Tables:
             parquet.write_table(arrow.Table.from_pylist(rows, schema=schema), file)
 
 
-# The page: first the flights that need a look, and why ----------------------------------------------------------------
+# The page: flights that need attention come first
 
 
-MOST_ROWS = 2000  # flights in a table of the page; flights.parquet has all
-LOOKS = 10  # flights that need a person that a terminal shows
+MOST_ROWS = 2000
+"""Largest number of flights in a table of the page. flights.parquet has all."""
+LOOKS = 10
+"""Largest number of flights with reasons that a terminal shows."""
 
 
 class Fleet:
@@ -296,14 +305,12 @@ class Fleet:
             return sets - declared, -declared, not row["error"], row["path"]
 
         self.flights = sorted(flights, key=rank)
-        self.looks = [
-            row for row in self.flights if row["why"]
-        ]  # those that need a person
+        self.looks = [row for row in self.flights if row["why"]]
         self.calm = [row for row in self.flights if not row["why"]]
         self.judged = [row for row in flights if not row["error"]]
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures of the whole by name, and those of the flights that need a person."""
+        """Return all figures by name, and the flights that need attention."""
         return {
             "flights": len(self.flights),
             "not_judged": len(self.flights) - len(self.judged),
@@ -317,7 +324,7 @@ class Fleet:
 
     @property
     def verdict(self) -> Verdict:
-        """How many flights need a look."""
+        """Verdict on the fleet: the number of flights that need attention."""
         count = _count(len(self.flights), "flight")
         if not self.looks:
             return Verdict(Severity.GOOD, f"HEALTHY: {count}, none needs a look.")
@@ -339,7 +346,7 @@ class Fleet:
         )
 
     def lines(self) -> list[str]:
-        """Say it all in sentences, the verdict first."""
+        """Return the result in sentences, the verdict first."""
         own, declaring = self.figures(), sum(row["declared"] > 0 for row in self.judged)
         counts = (
             f"{_count(own['vehicles'], 'vehicle')}; {_count(own['not_judged'], 'flight')} could not be judged;"
@@ -356,7 +363,7 @@ class Fleet:
         return [self.verdict.words, counts, *more]
 
     def text(self) -> str:
-        """Return the sentences, and the first flights that need a person, for a terminal."""
+        """Return the sentences and the first flights that need attention, for a terminal."""
         looks = [
             f"{shown(row['path'])}: {shown(' '.join(row['why']), LINE)}"
             for row in self.looks[:LOOKS]
@@ -367,7 +374,7 @@ class Fleet:
         return "".join(f"{line}\n" for line in [*self.lines(), *looks, *more])
 
     def html(self, about: Mapping[str, str]) -> str:
-        """Lay out the page; `about` says what was run."""
+        """Lay out the page. ``about``: head of the page."""
         hint = "Gyros declared faulty first, then sets, then what was not judged, and what was hardly checked."
         sections = [
             _section("Flights that need a look", hint, self.looks),
@@ -385,7 +392,7 @@ class Fleet:
 
 
 def columns_of(flights: Sequence[Row]) -> list[Column]:
-    """Return what is told of each flight: on the page and, by name, in JSON."""
+    """Return the columns of the flights, for the page and for JSON."""
 
     def column(name: str, head: str, say: Any) -> Column:
         return Column(name, [row[name] for row in flights], (head,), say)

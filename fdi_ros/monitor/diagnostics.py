@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Diagnostics: level, words and figures for every channel, every input and the whole."""
+"""Diagnostics: level, words and figures for the monitor, each channel and each input."""
 
 from __future__ import annotations
 
@@ -26,17 +26,26 @@ if TYPE_CHECKING:
 
 Values = tuple[tuple[str, str], ...]
 
-PREFIX = "fdi_node: "  # what names begin with where no node gives its full name, without the first slash, and a colon
-WHOLE = "monitor"  # name of the line about all, after the prefix
-INPUT = "input "  # what the name of the line about an input topic begins with, after the prefix
-FAR_FROM_NOW = 1.0  # stamps further than this from the clock of the monitor are not of this clock, s
-OLD = 86400.0  # stamps that far behind the clock are of a recording, most likely, s
+PREFIX = "fdi_node: "
+"""Default prefix of all names. A node uses its full name instead."""
+WHOLE = "monitor"
+"""Name of the line about the monitor as a whole, after the prefix."""
+INPUT = "input "
+"""Begin of the names of input topics, after the prefix."""
+FAR_FROM_NOW = 1.0
+"""Difference of stamps and clock from which on the stamps belong to another clock, s."""
+OLD = 86400.0
+"""Delay behind the clock from which on stamps probably belong to a recording, s."""
 OLD_WORDS = " (of a recording? then use_sim_time, and a player that gives the clock)"
-CERTAIN = 4.0  # standard deviations from which a delay between units is reported
+CERTAIN = 4.0
+"""Smallest delay between units that is reported, in standard deviations."""
 LEAST_DELAY = 0.001
-"""Smallest delay that is reported, s. Less is usual between drivers: 0.01 rad/s in turns of 10 rad/s^2."""
-MOST_CONCERNS = 3  # reasons not to call the whole healthy that its line lists
-NEARLY = 0.8  # share of ``bias.max_drift`` from which a drift is reported before the bias counts as a fault
+"""Smallest delay that is reported, s. Drivers often differ by less, which makes an error of
+0.01 rad/s at an angular acceleration of 10 rad/s^2."""
+MOST_CONCERNS = 3
+"""Largest number of concerns in the line about the monitor."""
+NEARLY = 0.8
+"""Share of ``bias.max_drift`` from which on a drift is reported. Above 1 it is a fault."""
 
 
 class Level(IntEnum):
@@ -79,31 +88,41 @@ class InputStatus:
     """Present state of one input topic."""
 
     name: str
+    """Name of the input."""
     topic: str
+    """Its topic."""
     received: int
-    rate: float  # messages per second, lately
-    silent: float | None  # time since the last message, s. None before the first one.
-    live: (
-        bool  # whether the input delivers, by the stamps of the others and by the clock
-    )
-    arrives: bool = False  # whether messages arrive, of use or not
-    lag: float = 0.0  # how far its stamps stay behind those of the other inputs, s
-    max_lag: float = math.inf  # largest lag within one instant, s
-    offset: float | None = (
-        None  # clock of the monitor minus the last stamp, s. None for messages without stamps.
-    )
-    counts: Mapping[str, int] = field(
-        default_factory=dict
-    )  # messages not taken as they came, by kind
-    recent: Mapping[str, int] = field(
-        default_factory=dict
-    )  # the same since the last regular report
-    error: str = ""  # why the last malformed message was refused
-    unstamped: bool = False  # whether its headers have no stamp
-    parted: bool = False  # whether its clock and the clock of the only other live input drifted apart
-    frame: str = ""  # frame_id of its first message
-    frame_now: str = ""  # frame_id of its last message
-    sources: str = ""  # fault of its publishers: a second publisher, or a second input on the topic
+    """Number of received messages."""
+    rate: float
+    """Recent messages per second, Hz."""
+    silent: float | None
+    """Time since the last message, s. None: no message yet."""
+    live: bool
+    """Whether the input delivers, by the stamps of the other inputs and by the clock."""
+    arrives: bool = False
+    """Whether messages arrive, usable or not."""
+    lag: float = 0.0
+    """Delay of its stamps behind those of the other inputs, s."""
+    max_lag: float = math.inf
+    """Largest lag of messages that belong to one instant, s."""
+    offset: float | None = None
+    """Clock of the monitor minus the last stamp, s. None: messages without stamps."""
+    counts: Mapping[str, int] = field(default_factory=dict)
+    """Messages that were not used as they came, by kind."""
+    recent: Mapping[str, int] = field(default_factory=dict)
+    """The same since the last regular report."""
+    error: str = ""
+    """Why the last malformed message was refused."""
+    unstamped: bool = False
+    """Whether its headers have no stamp."""
+    parted: bool = False
+    """Whether its clock drifted away from the clock of the only other live input."""
+    frame: str = ""
+    """frame_id of its first message."""
+    frame_now: str = ""
+    """frame_id of its last message."""
+    sources: str = ""
+    """Fault of its publishers: a second publisher, or a second input on the topic."""
 
 
 _LEVELS = {
@@ -111,7 +130,8 @@ _LEVELS = {
     ChannelState.AMBIGUOUS: Level.ERROR,
     ChannelState.FAULTY: Level.ERROR,
     ChannelState.STALE: Level.STALE,
-}  # of all other states a warning
+}
+"""Level by state. Other states are a warning."""
 _TIMES = (
     ("ms", 1e-3, 0.1, 1),
     ("s", 1, 600, 1),
@@ -119,7 +139,8 @@ _TIMES = (
     ("h", 3600, 172_800, 0),
     ("days", 86_400, 63_072_000, 0),
     ("years", 31_557_600, math.inf, 0),
-)  # name, seconds, upper end of the use in s, and decimals
+)
+"""Units of time: name, length in s, upper end of use in s, number of decimals."""
 ODD = {
     "malformed": "malformed messages",
     "duplicate": "repeated stamps",
@@ -142,25 +163,25 @@ def describe(
     warning: str = "",
     concerns: Sequence[Concern] = (),
 ) -> list[StatusLine]:
-    """Describe a monitor: the whole first, then every channel and every input topic.
+    """Describe a monitor: first as a whole, then each channel and each input topic.
 
     Parameters
     ----------
     status
         The monitor after its last sample.
     prefix
-        What all names begin with.
+        Prefix of all names.
     inputs
         Its input topics.
     figures
-        More keys and values for the whole.
+        More keys and values for the line about the monitor.
     silent
-        Time without samples, s, which makes all lines STALE; None while samples come.
+        Time without samples, s, which makes all lines STALE. None: samples arrive.
     since
-        Stamps of the messages that brought the channels into their states, ns; None: those of
+        Stamps of the messages that changed the states of the channels, ns. None: the stamps of
         the samples.
     warning
-        Further faults of the whole, in words; empty: none.
+        Further faults of the monitor, in words. Empty: none.
     concerns
         Reasons not to call channels or units healthy, as `RecentHealth` gives them.
     """
@@ -201,7 +222,7 @@ def describe(
 
 
 def _words_about(name: str, concerns: Sequence[Concern]) -> list[str]:
-    """Return what the concerns say of a channel or unit."""
+    """Return the concerns about a channel or unit, in words."""
     return [one.words for one in concerns if name in one.who]
 
 
@@ -215,7 +236,7 @@ def degraded(status: Status) -> dict[str, str]:
 
 
 def _find_worse(status: Status) -> dict[str, list[str]]:
-    """Return the same words without the name.
+    """Return the degradations of channels and units, without their names.
 
     Channels and units without degradation have no entry.
     """
@@ -297,7 +318,7 @@ def _whole_message(
 
 
 def _healthy_words(status: Status, healthy: Set[str]) -> str:
-    """Return how many channels are healthy; gyros and accelerometers apart where there are both."""
+    """Return the number of healthy channels, separately for gyros and accelerometers."""
 
     def counted(some: Sequence[ChannelStatus], called: str) -> str:
         count = sum(channel.name in healthy for channel in some)
@@ -313,7 +334,7 @@ def _healthy_words(status: Status, healthy: Set[str]) -> str:
 def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[str]:
     """Return the faults of whole units in words.
 
-    The setting that corrects delays stands with the last late unit.
+    The last late unit is followed by the setting that corrects delays.
     """
     late = [unit for unit in status.units if unit.name in worse]
     words = [
@@ -461,7 +482,7 @@ def _frozen_units(channel: ChannelStatus, status: Status) -> list[UnitStatus]:
 
 
 def _format_state(channel: ChannelStatus, status: Status) -> str:
-    # No sample has changed the state that a channel starts in.
+    # ``since`` is 0 in the initial state of a channel.
     ago = max(0, status.stamp - channel.since) / 1e9
     lasting = (
         "since the start"
@@ -625,7 +646,7 @@ DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
 def encode_diagnostics(lines: Sequence[StatusLine], now: int) -> bytes:
     """Encode diagnostics, stamped at the clock time now, ns, clipped to the times that a header can hold."""
-    # A simulator may publish any time.
+    # A simulator may publish any clock.
     out = bytearray(
         struct.pack(
             "<4BiI", 0, 1, 0, 0, *divmod(min(max(now, 0), LAST_STAMP), 1_000_000_000)

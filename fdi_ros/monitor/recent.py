@@ -3,9 +3,8 @@
 
 """Health of channels and units over the last minute of a running monitor.
 
-`RecentHealth` counts what a replay counts over a whole recording, and asks the same function
-for concerns. So diagnostics and `fdi watch` give the verdict that a replay of the last minute
-would give.
+`RecentHealth` counts the same quantities as a replay and uses the same function for concerns. So
+diagnostics and `fdi watch` give the verdict that a replay of the last minute would give.
 """
 
 from __future__ import annotations
@@ -35,15 +34,15 @@ if TYPE_CHECKING:
     from fdi_ros.monitor.status import Status
 
 READINGS = 60
-"""Readings that are kept, one a second."""
+"""Number of readings that are kept, one per second."""
 LEAST_READINGS = 10
-"""Readings that a share needs, and over which the rate of a unit is measured."""
+"""Smallest number of readings for a share, and number for the rate of a unit."""
 LEAST_RESIDUALS = 30
-"""Residuals that a comparison of noise needs."""
+"""Smallest number of residuals for a comparison of noise."""
 USUAL_QUANTILE = 0.9
 """Quantile of the rates of a unit that is its usual rate."""
 MOST_RATES = 600
-"""Rates of a unit from which its usual rate is found; the oldest are forgotten."""
+"""Largest number of rates of a unit, from which its usual rate follows."""
 
 _COUNTED = ("samples", "missing", "non-finite", "out of range", "spikes")
 _UNCHECKED = (ChannelState.UNCHECKED, ChannelState.STALE)
@@ -59,7 +58,7 @@ class _Reading(NamedTuple):
     unchecked: Mask
     """(n,) channels that no other channel checks."""
     residual: Array
-    """(n,) residuals of the channels that are OK, rad/s; NaN for the others."""
+    """(n,) residuals of the channels that are OK, rad/s. NaN for the others."""
     received: Int
     """(u,) messages of each input topic."""
     has_rate: bool
@@ -75,7 +74,7 @@ class RecentHealth:
         self._concerns: list[Concern] = []
 
     def add(self, status: Status, inputs: Sequence[InputStatus], at: float) -> None:
-        """Read the counts of a monitor at a time, s. Readings begin anew if time goes back or channels come."""
+        """Add a reading at a time, s. Earlier readings are dropped if time goes back or channels change."""
         reading = _reading(status, inputs, at)
         if self._readings:
             before = self._readings[-1]
@@ -92,7 +91,7 @@ class RecentHealth:
         return self._concerns
 
     def _channels(self, status: Status) -> Iterator[ChannelHealth]:
-        """Yield each channel that is in use and not declared faulty."""
+        """Yield each channel in use that is not declared faulty."""
         first, last = self._readings[0], self._readings[-1]
         samples, missing, non_finite, at_end, spikes = last.counts - first.counts
         total = samples + missing
@@ -103,7 +102,7 @@ class RecentHealth:
         for i, one in enumerate(status.channels):
             if one.is_left_out or one.state == ChannelState.AMBIGUOUS:
                 continue
-            # A stream that stands is reported as a whole.
+            # A stream that has stalled is reported as a whole.
             delivered = (samples[i] - non_finite[i]) / total[i] if total[i] else 1.0
             yield ChannelHealth(
                 name=one.name,
@@ -126,9 +125,9 @@ class RecentHealth:
         return RateHealth(float(missing), None, 1.0 - missing / len(published))
 
     def _residual_rms(self, status: Status) -> list[float | None]:
-        """Return the root mean square of each channel's residual, rad/s; None: not compared.
+        """Return the root mean square of each channel's residual, rad/s. None: not compared.
 
-        While a fault is declared, nothing is compared: the fault disturbs the fused rate.
+        A declared fault disturbs the fused rate, so that no comparison is possible.
         """
         residuals = np.array([one.residual for one in self._readings])
         enough = np.isfinite(residuals).sum(axis=0) >= LEAST_RESIDUALS
@@ -143,13 +142,13 @@ class RecentHealth:
     def _units(
         self, status: Status, inputs: Sequence[InputStatus]
     ) -> Iterator[UnitHealth]:
-        """Yield how each input topic delivered, against its usual rate and the other topics."""
+        """Yield the health of each input topic, relative to its usual rate and to the other topics."""
         rate = self._rate(LEAST_READINGS)
         if rate is None or not len(rate):
             return
         usual = np.quantile([*self._rates, rate], USUAL_QUANTILE, axis=0)
         usual = np.maximum(usual, 1e-9)
-        # All topics lack what a busy computer lost.
+        # Messages that a busy computer lost are missing on all topics.
         best = float((rate / usual).max())
         if best > 0.0 and (rate >= LEAST_DELIVERED * best * usual).all():
             self._rates.append(rate)
@@ -166,7 +165,7 @@ class RecentHealth:
             )
 
     def _rate(self, readings: int) -> Array | None:
-        """Return the messages of each topic per second over the last readings, Hz; None: too few."""
+        """Return the rate of each topic over the last readings, Hz. None: too few readings."""
         last = self._readings[-1]
         if len(self._readings) < LEAST_READINGS:
             return None

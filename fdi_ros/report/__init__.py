@@ -1,4 +1,4 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The kit of all pages and tables: sections, plots, long series, text tables, units."""
+"""Building blocks of pages and tables: sections, plots, long series, text tables, units."""

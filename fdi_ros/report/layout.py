@@ -1,19 +1,20 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pages in one HTML file that need nothing else (no network, no other file, no library), and tables for a terminal.
+"""Pages in one HTML file without network, other files or libraries, and tables for a terminal.
 
-The plots are drawn in the browser by the scripts beside this file. A figure is a mapping of ``data`` and ``layout`` in
-the form of plotly's figures, of which the scripts draw:
+The scripts beside this file draw the plots in the browser. A figure is a mapping of ``data`` and
+``layout`` in the form of plotly's figures. The scripts draw:
 
 - traces ``scatter`` (x, y, mode, name, line, legendgroup, showlegend, and ``rank`` in the legend), ``heatmap``,
-  ``scatter3d`` (lines);
-- axes with title, type ``log``, range; shapes ``rect`` over all y; height;
+  ``scatter3d`` (lines),
+- axes with title, type ``log``, range, shapes ``rect`` over all y, height.
 
-and beyond that: traces ``band`` (x, low, high) and ``spans`` (row, from, to, text, pattern); series of a `PageStore`
-(``packed``, with ``plus`` or ``spread``); layout ``title``; ``link`` (plots of one name share zoom and cursor),
-``scale`` (plots of one name share the scale of values), ``robust`` (what shows only for a short time does not set the
-scale), ``needed`` (times that must be within it), ``marks`` (x, kind, text, ``label``), ``rows`` of spans.
+They also draw traces ``band`` (x, low, high) and ``spans`` (row, from, to, text, pattern), and series of a
+`PageStore` (``packed``, with ``plus`` or ``spread``). The layout has ``title``, ``link`` (plots with
+this name share zoom and cursor), ``scale`` (plots with this name share the scale of values),
+``robust`` (short peaks do not set the scale), ``needed`` (times that the scale must cover), ``marks``
+(x, kind, text, ``label``) and ``rows`` of spans.
 """
 
 from __future__ import annotations
@@ -39,54 +40,61 @@ from fdi_ros.system.text import LINE, WORD, date_of, shown, visible
 
 
 class Severity(Enum):
-    """How bad a verdict is; the value is its class on a page."""
+    """Severity of a verdict. The value is its class on a page."""
 
-    GOOD = "good"  # nothing to do
-    UNKNOWN = "unknown"  # the data do not tell, or not enough
-    BAD = "bad"  # somebody must act
+    GOOD = "good"
+    """No action is needed."""
+    UNKNOWN = "unknown"
+    """The data leave a question open."""
+    BAD = "bad"
+    """Action is needed."""
 
     @property
     def exit_code(self) -> int:
-        """Of a verb that ends with such a verdict; 1 is an unmet ``--check``, 2 a request that is wrong."""
+        """Exit code of a verb. 1 means an unmet ``--check``, and 2 wrong arguments."""
         return {Severity.GOOD: 0, Severity.UNKNOWN: 4, Severity.BAD: 3}[self]
 
 
 class Verdict(NamedTuple):
-    """One line, and how bad it is."""
+    """A verdict in one line, with its severity."""
 
     severity: Severity
-    words: str  # begins with the word of the verdict in capitals: ``HEALTHY: ...``
+    """The severity."""
+    words: str
+    """The verdict, which begins with its word in capitals: ``HEALTHY: ...``."""
 
 
 class Unit(NamedTuple):
     """A unit of angular rate."""
 
     name: str
-    factor: float  #: of it in one rad/s
+    """Name of the unit."""
+    factor: float
+    """Number of these units in 1 rad/s."""
 
     def words(self, value: float | None, digits: int = 6) -> str:
         """Return a rate, rad/s, in this unit, or a dash."""
         return "-" if value is None else f"{value * self.factor:.{digits}f} {self.name}"
 
     def named(self, text: str) -> str:
-        """Return a title or the like that says rad/s with this unit instead."""
+        """Replace rad/s in a text by this unit."""
         return text.replace(RADIANS.name, self.name)
 
 
 RADIANS, DEGREES = Unit("rad/s", 1.0), Unit("deg/s", math.degrees(1.0))
-FORCES = Unit("m/s^2", 1.0)  # of accelerometers, whatever unit rates are printed in
+FORCES = Unit("m/s^2", 1.0)
+"""Unit of accelerometers, whatever the unit of rates is."""
 
 
 def unit_of(degrees: bool) -> Unit:
-    """Return the unit that was asked for."""
+    """Return the unit for rates."""
     return DEGREES if degrees else RADIANS
 
 
-Rows = tuple[
-    Sequence[str], Sequence[Sequence[str]]
-]  # head and rows of a table, as `table` and `html_table` take them
+Rows = tuple[Sequence[str], Sequence[Sequence[str]]]
+"""Head and rows of a table, for `table` and `html_table`."""
 Columns = Mapping[str, Callable[[Any], str]]
-"""Columns of a table by their heads: what each says of that which a row is about."""
+"""Columns of a table by their heads. Each function returns the cell of an item."""
 
 
 def head_and_rows(columns: Columns, items: Iterable[Any]) -> Rows:
@@ -97,21 +105,22 @@ def head_and_rows(columns: Columns, items: Iterable[Any]) -> Rows:
 
 
 class Column(NamedTuple):
-    """A figure of all that a table has rows of: by name for programs, in SI units, and in words for people."""
+    """A column of a table, in SI units for programs and as text for people."""
 
-    name: str  #: empty: for people alone
-    values: (
-        Sequence[Any] | NDArray[Any]
-    )  #: one for each row; of several heads one for each of them
-    heads: Sequence[str] = ()  #: empty: for programs alone
-    say: str | Callable[[Any], str] = (
-        ""  #: words of a value, or the format that makes them
-    )
-    factor: float = 1.0  #: of what people are told over the SI unit
+    name: str
+    """Name for programs. Empty: the column is only for people."""
+    values: Sequence[Any] | NDArray[Any]
+    """One value per row. With several heads, one value per head in each row."""
+    heads: Sequence[str] = ()
+    """Heads for people. Empty: the column is only for programs."""
+    say: str | Callable[[Any], str] = ""
+    """Format of a value, or a function that returns its text."""
+    factor: float = 1.0
+    """Factor from the SI unit to the unit for people."""
 
 
 def figures_of(columns: Iterable[Column]) -> list[dict[str, Any]]:
-    """Return a row for each item, for programs: its figures by name."""
+    """Return the figures of each row by name, for programs."""
     named = [column for column in columns if column.name]
     rows = zip(*(column.values for column in named), strict=True)
     return [
@@ -120,7 +129,7 @@ def figures_of(columns: Iterable[Column]) -> list[dict[str, Any]]:
 
 
 def told(columns: Iterable[Column], unit: Unit = RADIANS) -> Rows:
-    """Lay out a row for each item, for people, with this unit in the heads."""
+    """Lay out a row for each item, for people, with the given unit in the heads."""
     shown_ones, cells = [column for column in columns if column.heads], []
     for column in shown_ones:
         say = column.say if callable(column.say) else f"{{:{column.say}}}".format
@@ -143,10 +152,10 @@ def told(columns: Iterable[Column], unit: Unit = RADIANS) -> Rows:
 def table(
     head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = True
 ) -> list[str]:
-    """Lay out lines of words in columns as wide as their widest entries; what a terminal would obey is escaped.
+    """Lay out lines of text in columns, with control characters escaped.
 
-    ``figures``: the columns after the first hold figures, which end below each other. Else all hold words, which begin
-    below each other; long ones are shortened.
+    ``figures``: the columns after the first hold figures and are aligned to the right. Otherwise all
+    columns are aligned to the left, and long texts are shortened.
     """
     most = LINE if figures else WORD
     lines = [tuple(head), *(tuple(shown(cell, most) for cell in row) for row in rows)]
@@ -158,12 +167,12 @@ def table(
 
 
 def indented(lines: Iterable[str]) -> str:
-    """Return lines as one text, set in by two blanks."""
+    """Return lines as one text, indented by two blanks."""
     return "".join(f"  {line}\n" for line in lines)
 
 
 def number(value: float | None, form: str = ".3f", unit: str = "") -> str:
-    """Return a number with a unit, or a dash where it is not known, or not finite."""
+    """Return a number with a unit, or a dash if the number is unknown or not finite."""
     return "-" if value is None or not math.isfinite(value) else f"{value:{form}}{unit}"
 
 
@@ -183,17 +192,17 @@ PALETTE = (
     "#7f7f7f",
     "#b8a500",
 )
-"""Colours that differ for colour-blind people too (after Okabe and Ito)."""
-CHANNEL_COLOURS = (
-    *PALETTE,
-    "#9a4dff",
-    "#e20134",
-    "#00b4a0",
-)  # as many as there may be channels
-LONG = 24  # characters from which on the text of a cell may go on in a second line
-TERMINAL = 110  # characters in a line of sentences
-PAPER_ROWS = 60  # of a table, as page.css has it
-FEWEST_LINKED = 4  # sections from which on a page has a table of contents
+"""Colours that colour-blind people can distinguish (after Okabe and Ito)."""
+CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")
+"""Colours of the channels."""
+LONG = 24
+"""Length from which on the text of a cell may wrap, characters."""
+TERMINAL = 110
+"""Length of a line of sentences, characters."""
+PAPER_ROWS = 60
+"""Rows of a table on paper, as in page.css."""
+FEWEST_LINKED = 4
+"""Smallest number of sections for a table of contents."""
 TIME_AXIS = "s from the first sample"
 _SCRIPTS = (
     "plot_data.js",
@@ -206,11 +215,11 @@ _SCRIPTS = (
 
 
 Figure = dict[str, Any]
-"""Traces under ``data``, axes and the like under ``layout``: JSON for the scripts, as described above."""
+"""Traces under ``data`` and axes under ``layout``, as JSON for the scripts."""
 
 
 Content = str | Rows | list[str] | Mapping[str, str]
-"""What a section tells beside its plots: HTML; or a table, sentences, names with what they stand for."""
+"""Content of a section beside its plots: HTML, a table, sentences, or names with meanings."""
 
 
 @dataclass(frozen=True)
@@ -218,15 +227,17 @@ class Section:
     """One part of a page."""
 
     title: str
+    """Title of the section."""
     hint: str = ""
+    """Sentence below the title."""
     content: Content = ""
-    figures: Sequence[Mapping[str, Any]] = field(
-        default_factory=tuple
-    )  #: each a `Figure`
+    """Content beside the plots."""
+    figures: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
+    """Plots, each a `Figure`."""
 
 
 def section_lines(section: Section) -> list[str]:
-    """Lay out a section for a terminal, without its plots; its content is a table or sentences."""
+    """Lay out a section for a terminal, without plots. The content must be no HTML."""
     lines = [section.title, *textwrap.wrap(section.hint, TERMINAL)]
     return [
         *lines,
@@ -239,7 +250,7 @@ def section_lines(section: Section) -> list[str]:
 
 
 def text_of(lines: Sequence[str], sections: Iterable[Section]) -> str:
-    """Lay out lines, and sections below them, for a terminal."""
+    """Lay out lines and sections for a terminal."""
     return "\n".join(
         [
             *lines,
@@ -249,7 +260,7 @@ def text_of(lines: Sequence[str], sections: Iterable[Section]) -> str:
 
 
 def section_text(section: Section) -> str:
-    """Lay out a section for a terminal as a text of its own: what is below the title is set in."""
+    """Lay out a section for a terminal as a separate text, indented below the title."""
     title, *lines = section_lines(section)
     return f"{title}\n{indented(lines)}"
 
@@ -257,7 +268,7 @@ def section_text(section: Section) -> str:
 def html_table(
     head: Sequence[str], rows: Iterable[Sequence[str]], sort: bool = False
 ) -> str:
-    """Lay out a table that scrolls by itself; on paper it has the first rows; a reader may sort and filter it."""
+    """Lay out a table that can be scrolled, sorted and filtered. Paper has the first rows."""
     rows = list(rows)
     cells = "".join(_cell(name, "th scope=col") for name in head)
     body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
@@ -270,12 +281,12 @@ def html_table(
 
 
 def escape(text: str) -> str:
-    """Return a text, which may come from a file, as HTML that shows it."""
+    """Return a text from any source as safe HTML."""
     return html.escape(visible(text))
 
 
 class Link(str):
-    """A text that leads to another page; `page` is its path from this one, empty: none."""
+    """A text that links to another page. ``page``: relative path. Empty: no link."""
 
     page: str
 
@@ -287,7 +298,7 @@ class Link(str):
 
 
 def _cell(text: str, tag: str = "td") -> str:
-    # Figures and names are not broken over lines; sentences are.
+    # Only sentences wrap, figures and names do not.
     content = escape(text)
     if isinstance(text, Link) and text.page:
         content = f'<a href="{html.escape(quote(text.page))}">{content}</a>'
@@ -309,7 +320,7 @@ def html_of(content: Content) -> str:
             )
             + "</ul>"
         )
-    # On a narrow screen one below the other.
+    # On a narrow screen the entries are below each other.
     rows = (
         f'<tr><th scope="row">{escape(name)}</th><td>{escape(words)}</td></tr>'
         for name, words in content.items()
@@ -327,9 +338,9 @@ def page(
 ) -> str:
     """Lay out a page.
 
-    ``summary``: sentences at the top, of which the first is the verdict, in the colour of its ``severity`` (None: there
-    is no verdict). ``store`` holds the long series that figures name by ``packed``. ``origin``: UTC that times count
-    from, ns; None: not known.
+    ``summary``: sentences at the top, the first of which is the verdict. ``severity``: colour of the
+    verdict. None: no verdict. ``store``: long series, which figures reference by ``packed``.
+    ``origin``: time zero in UTC, ns. None: unknown.
     """
     looks = [
         "" if severity is None else f" class={severity.value}",
@@ -366,19 +377,19 @@ def page(
         ),
         "SCRIPT": "".join(map(_resource, _SCRIPTS)),
     }
-    # In one pass: what is put in is not searched for places.
+    # One pass, so that inserted text is not searched for placeholders.
     return re.sub(
         "<!--([A-Z]+)-->", lambda place: parts[place[1]], _resource("page.html")
     )
 
 
 def _anchor(section: Section) -> str:
-    """Name of a section in a link."""
+    """Return the name of a section in a link."""
     return re.sub("[^a-z0-9]+", "-", section.title.lower()).strip("-")
 
 
 def _speaking(section: Section, store: PageStore | None) -> Section:
-    """Return a section without the plots in which nothing would be drawn; if none is left, it says so."""
+    """Return a section without empty plots. If no plot is left, a sentence states that."""
     figures = [
         figure
         for figure in section.figures
@@ -401,7 +412,7 @@ def _draws(trace: Mapping[str, Any], store: PageStore | None) -> bool:
 
 
 def _section(section: Section, number: int) -> list[str]:
-    """Lay out a section; its figures are numbered from `number`."""
+    """Lay out a section with figures numbered from ``number``."""
     head = f"<h2>{escape(section.title)}</h2>" + (
         f'<p class="hint">{escape(section.hint)}</p>' if section.hint else ""
     )
@@ -414,7 +425,7 @@ def _section(section: Section, number: int) -> list[str]:
         f'<figure data-figure="{k}"><div class="stage" tabindex="0"></div></figure>'
         for k in numbers
     ]
-    # On paper the head stays with the first plot.
+    # On paper the title stays with the first plot.
     first = f'<div class="keep">{head}<div class="legend"></div>{places[0]}</div>'
     begin, end = (
         f'<section id="{_anchor(section)}" class="plots">{first}',
@@ -424,7 +435,7 @@ def _section(section: Section, number: int) -> list[str]:
 
 
 def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:
-    """Layout of a plot over time, linked with all others; of plots below each other the last has the axis."""
+    """Return the layout of a plot over time. Only the last of several plots has the axis."""
     axis: dict[str, Any] = {"title": {"text": TIME_AXIS}, "hidden": not last}
     return {"height": height + 30 * last, "link": "time", "xaxis": axis, **more}
 
@@ -435,19 +446,19 @@ def colour_of(channel: int) -> str:
 
 
 def drawn(value: float | None) -> float | None:
-    """Return a value as a figure has it: to four digits, None where it is not known, or not finite."""
+    """Return a value with four digits, or None if unknown or not finite."""
     return float(f"{value:.4g}") if value is not None and math.isfinite(value) else None
 
 
 def _safe_json(data: Any) -> str:
-    # Within a script element the only thing that could end it is a tag.
+    # Only a tag can end a script element.
     return json.dumps(_visible(data), separators=(",", ":"), allow_nan=False).replace(
         "<", "\\u003c"
     )
 
 
 def _visible(data: Any) -> Any:
-    """Return figures, of plain types, with texts that a browser shows as they are."""
+    """Return figures of plain types, with control characters in texts escaped."""
     if isinstance(data, str):
         return visible(data)
     if isinstance(data, Mapping):
@@ -461,35 +472,44 @@ def _resource(name: str) -> str:
     return resources.files("fdi_ros.report").joinpath(name).read_text(encoding="utf-8")
 
 
-# Series of any length, made small: few bytes per value, and no more values than a page may have ----------------------
+# Series of any length in bounded memory
 
 
-BYTES = 600_000  # text that the series of a page may take
+BYTES = 600_000
+"""Largest size of the series of a page as text, bytes."""
 FINE, SMALL = "f4", "f2"
-"""Kinds of a series: 24 bits, for values that are looked at against each other; 11 bits, 0.05 % of the value."""
+"""Kinds of a series: 24 bits for values that are compared, 11 bits (0.05 %) for others."""
 LARGEST_HALF = 65504.0
-_TEXT = 4 / 3  # characters of base64 per byte
+_TEXT = 4 / 3
+"""Characters of base64 per byte."""
 
 
 class PageStore:
-    """Series over one time, of which a page keeps all samples, or the extremes of spans of samples; memory is bounded.
+    """Series over time in bounded memory: all samples, or the extremes of spans of samples.
 
-    When there are too many spans, neighbours are put together and the next spans are twice as long. ``kinds``: name and
-    kind of each of c series. ``most``: spans that are kept, 2 or more, half of them once samples are put together (a
-    span of several samples is two values); None: as many as a page may hold.
+    If spans become too many, neighbours are merged, and the next spans are twice as long.
+
+    Parameters
+    ----------
+    kinds
+        Name and kind of each of c series.
+    most
+        Largest number of spans, at least 2. Merged spans need two values each, so that half as many
+        are kept. None: as many as a page can hold.
     """
 
     def __init__(self, kinds: Mapping[str, str], most: int | None = None) -> None:
         self.kinds = dict(kinds)
         size = 8 + sum(int(kind[1]) for kind in kinds.values())
         self._most = most or max(200, int(BYTES / _TEXT / size))
-        self.width = 1  # samples in a new span
+        self.width = 1
+        """Number of samples in a new span."""
         self._time = np.empty(0)
         self._low = self._high = np.empty((0, len(kinds)))
         self._waiting = (np.empty(0), np.empty((0, len(kinds))))
 
     def add(self, time: Array, values: Array) -> None:
-        """Take in the next samples: time (N,) s, values (N, c) of every series in order."""
+        """Add samples: time (N,), s, and values (N, c) of all series in order."""
         values = np.vstack(
             [self._waiting[1], np.where(np.isfinite(values), values, np.nan)]
         )
@@ -517,7 +537,7 @@ class PageStore:
         )
 
     def spans(self) -> tuple[Array, Array, Array]:
-        """Return what there is: time of the first sample (k,), smallest and largest values (k, c)."""
+        """Return the spans: time of the first sample (k,), smallest and largest values (k, c)."""
         time, values = self._waiting
         if len(time) == 0:
             return self._time, self._low, self._high
@@ -533,7 +553,7 @@ class PageStore:
         return bool(np.isfinite(self.spans()[1][:, list(self.kinds).index(name)]).any())
 
     def data(self) -> dict[str, Any]:
-        """Return what the page's script reads."""
+        """Return the series for the scripts of the page."""
         time, *extremes = self.spans()
         kept = extremes if self.width > 1 else extremes[:1]
         series = {
@@ -555,7 +575,7 @@ def _packed(values: Array, kind: str) -> str:
 
 
 def _extremes(low: Array, high: Array, together: int) -> tuple[Array, Array]:
-    """Smallest and largest of every `together` rows; NaN only where all are."""
+    """Return extremes of every ``together`` rows. NaN: all values are NaN."""
     shape = (-1, together, low.shape[1])
     return np.fmin.reduce(low.reshape(shape), axis=1), np.fmax.reduce(
         high.reshape(shape), axis=1

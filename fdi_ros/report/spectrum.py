@@ -1,10 +1,10 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Spectrum of what channels differ by from the others: where vibration is, and what of it may be folded down.
+"""Spectrum of the difference of each channel from the others, which shows vibration and aliasing.
 
-Welch's method over pieces without a gap, in bounded memory. What vibrates faster than half the sample rate is sampled
-as something slower: it cannot be told from a true line there, only be warned of.
+Welch's method over pieces without a gap, in bounded memory. Vibration above half the sample rate is
+aliased to a lower frequency. The spectrum cannot distinguish the two and only warns.
 """
 
 from __future__ import annotations
@@ -16,13 +16,16 @@ import numpy as np
 from fdi_ros.model.samples import Array
 from fdi_ros.report.layout import RADIANS, Section, Unit, colour_of, drawn
 
-PIECE = 512  # samples of one of the spectra that are averaged
-AT_ONCE = 16 * PIECE  # samples of which spectra are taken at once
-AROUND = 31  # frequencies whose median is the baseline next to a line
-STANDS_OUT = (
-    4.0  # a line has so many times the amplitude density that is usual next to it
-)
-FLAT = 0.8  # what has more than this share of the usual amplitude density at half the sample rate goes on beyond it
+PIECE = 512
+"""Samples of each averaged spectrum."""
+AT_ONCE = 16 * PIECE
+"""Samples that are transformed at once."""
+AROUND = 31
+"""Number of frequencies whose median is the baseline of a line."""
+STANDS_OUT = 4.0
+"""Smallest ratio of a line to its baseline."""
+FLAT = 0.8
+"""Share of the usual amplitude density at half the sample rate from which on aliasing is likely."""
 MOST_LINES = 3
 
 
@@ -32,14 +35,14 @@ class Spectrum:
     def __init__(self, names: Sequence[str], rate: float) -> None:
         self._names, self._rate = names, rate
         self._waiting = np.empty((0, len(names)))
-        """Samples of which none is averaged yet, but for half a piece: all of the same channels."""
+        """Samples that are not averaged yet, all of the same channels, and half a piece that is."""
         self._power, self._weight = (
             np.zeros((PIECE // 2 + 1, len(names))),
             np.zeros(len(names)),
         )
 
     def add(self, values: Array) -> None:
-        """Take in the next samples (N, n), rad/s; where a channel begins or ends to be missing a new piece begins."""
+        """Add samples (N, n), rad/s. A new piece begins if a channel disappears or returns."""
         values = np.vstack([self._waiting, values])
         there = np.isfinite(values)
         cuts = np.flatnonzero((there[1:] != there[:-1]).any(axis=1)) + 1
@@ -51,13 +54,13 @@ class Spectrum:
             self._waiting = self._waiting[AT_ONCE - PIECE // 2 :]
 
     def begin_stretch(self) -> None:
-        """Note that the next sample does not follow the last one."""
+        """Begin a new piece at a gap."""
         if len(self._waiting) >= PIECE:
             self._average(self._waiting)
         self._waiting = self._waiting[:0]
 
     def section(self, unit: Unit = RADIANS) -> Section | None:
-        """Draw it, and say where it stands out; None: no piece was long enough."""
+        """Draw the spectrum and name its lines. None: no piece was long enough."""
         self.begin_stretch()
         known = np.flatnonzero(self._weight).tolist()
         if not known:
@@ -96,8 +99,8 @@ class Spectrum:
         )
 
     def _words(self, density: Array) -> str:
-        """Say where lines stand out (the density is without that at 0 Hz), and what of it may be folded."""
-        # Imported here: readers of recordings do not need it.
+        """Name the lines and likely aliases. ``density``: without 0 Hz."""
+        # Imported late, because most users do not need SciPy.
         from scipy.ndimage import median_filter
         from scipy.signal import find_peaks
 

@@ -26,9 +26,12 @@ from fdi_ros.monitor.soundness import (
     word_of,
 )
 from fdi_ros.replay.health import MOST_WINDOWS, Deliveries, Values
+from fdi_ros.replay.run import replay
+from fdi_ros.replay.words import sentences
 
 CASES = ROOT.parent / "shared" / "data" / "cases"
 LOGS = ROOT.parent / "shared" / "data" / "logs"
+SITL = ROOT.parent / "shared" / "data" / "sitl"
 TRIADS = Geometry.from_triads([np.eye(3)] * 3)
 
 needs_cases = pytest.mark.skipif(
@@ -156,6 +159,19 @@ def test_concerns_name_what_is_wrong_and_nothing_else():
         "c repeats the values of a: one sensor, no redundancy",
         "b.x has 5 spikes of one sample",
     ]
+
+
+@pytest.mark.skipif(not SITL.is_dir(), reason="../shared/data/sitl is not there")
+def test_a_log_in_which_all_values_repeat_for_long_is_not_healthy():
+    result = replay(SITL / "calm.tlog", end=60.0)
+    assert result.verdict.word == "CANNOT TELL"
+    assert 33.0 < result.monitor.rate.missing_s < 35.0
+    assert result.monitor.rate.missing_from_s == pytest.approx(10.0, abs=0.1)
+    concerns = list(map(str, result.concerns))
+    assert "the fused rate was not published for 34 s, first at 10.0 s" in [
+        re.sub(r"33\.\d|34\.\d", "34", one) for one in concerns
+    ]
+    assert any("IMU 1" in line for line in sentences(result))
 
 
 @pytest.mark.parametrize(
