@@ -180,6 +180,7 @@ SWEEP: dict[str, tuple[str, dict[str, str]]] = {
         "Of a kind and size of fault, beside its numbers by their names",
         {
             "kind": "of fault",
+            "channels": "that were struck: `gyros`, or `accelerometers` with sizes in m/s^2",
             "faults": "how many were tried",
             "named": "share isolated: `value`, and its 95 % interval, `low` and `high`",
             "found": "share isolated, or in an ambiguity group: the same",

@@ -300,8 +300,9 @@ VERBS = {
             "bag": {},
             "--config": {},
             "--fault": takes(
-                "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3'; may be repeated; default: bias,"
-                " drift, noise, scale, stuck, dropout"
+                "kind and sizes to try: 'kind=bias size=0.05,0.1,0.3', of accelerometers in m/s^2"
+                " 'channel=accelerometers kind=bias size=1,3'; may be repeated; default: bias, drift, noise, scale,"
+                " stuck, dropout of both"
             ),
             "--times": takes(
                 "number of start times per channel and fault; default 10",

@@ -240,7 +240,11 @@ def run_sweep(arguments: Namespace) -> int:
     )
     tried = {
         "compared with": ", ".join(arguments.compare) or "nothing",
-        "faults": "; ".join(swept.words for swept in plan.faults),
+        "faults": "; ".join(
+            swept.words
+            for swept in plan.faults
+            if any(one.struck(swept) for one in results)
+        ),
         "times, watched for, seed": f"{plan.times}, {plan.within:g} s, {plan.seed}",
     }
     head = about(arguments, config_words(arguments), tried)
@@ -258,11 +262,18 @@ def run_sweep(arguments: Namespace) -> int:
 
 
 def _plan(arguments: Namespace) -> Plan:
-    from fdi_ros.replay.sweep import DEFAULT_FAULTS, Plan, parse_swept
+    from fdi_ros.replay.sweep import (
+        DEFAULT_FAULTS,
+        FORCE_FAULTS,
+        Plan,
+        parse_swept,
+    )
     from fdi_ros.system.jobs import worker_count
 
     swept = tuple(
-        one for text in arguments.fault or DEFAULT_FAULTS for one in parse_swept(text)
+        one
+        for text in arguments.fault or (*DEFAULT_FAULTS, *FORCE_FAULTS)
+        for one in parse_swept(text)
     )
     if not 1 <= arguments.times <= MOST_TIMES:
         raise ConfigError(f"--times is {arguments.times}, expected 1 to {MOST_TIMES}")
@@ -334,6 +345,7 @@ def _alignment(config: Config) -> object:
         config.imus.delays,
         config.imus.max_skew,
         config.imus.timeout,
+        config.accelerometers.enabled == "off",
     )
 
 

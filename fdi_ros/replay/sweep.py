@@ -25,6 +25,7 @@ from fdi_ros.errors import BagError, FaultError, FdiError
 from fdi_ros.faults.fault import Fault, Injector, fault_from, key_values
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.model.samples import Array, Block, Mask
+from fdi_ros.monitor.accelerometers import felt_units
 from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
@@ -42,7 +43,19 @@ DEFAULT_FAULTS = (
     "kind=stuck",
     "kind=dropout",
 )
-"""Default faults. Sizes are in rad/s, in rad/s^2, or a share of the rate."""
+"""Default faults of gyros. Sizes are in rad/s, in rad/s^2, or a share of the rate."""
+FORCE_FAULTS = (
+    "channel=accelerometers kind=bias size=0.1,0.3,1,3,10",
+    "channel=accelerometers kind=drift size=0.03,0.1,0.3",
+    "channel=accelerometers kind=noise size=1,5",
+    "channel=accelerometers kind=scale size=0.05,0.2",
+    "channel=accelerometers kind=stuck",
+    "channel=accelerometers kind=dropout",
+)
+"""Default faults of accelerometers. Sizes are in m/s^2, in m/s^3, or a share of the specific force."""
+GYROS, FORCES = "gyros", "accelerometers"
+FORCE_UNITS = {"rad/s": "m/s^2", "rad/s^2": "m/s^3"}
+"""Units of sizes in accelerometers, by those in gyros."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +65,8 @@ class Swept:
     kind: str
     items: tuple[tuple[str, str], ...]
     """Its numbers by name, as the user wrote them."""
+    channels: str = GYROS
+    """Channels that are struck: `GYROS` or `FORCES`."""
 
     @property
     def size(self) -> float | None:
@@ -64,23 +79,25 @@ class Swept:
     def unit(self) -> str:
         """Unit of the size."""
         option = FAULT_KINDS[self.kind].options().get("size")
-        return option.unit if option else ""
+        unit = option.unit if option else ""
+        return FORCE_UNITS.get(unit, unit) if self.channels == FORCES else unit
 
     @property
     def family(self) -> str:
         """Name that the fault shares with other sizes."""
-        return " ".join(
-            [
-                self.kind,
-                *(f"{name}={value}" for name, value in self.items if name != "size"),
-            ]
-        )
+        options = (f"{name}={value}" for name, value in self.items if name != "size")
+        return " ".join([self.called, *options])
+
+    @property
+    def called(self) -> str:
+        """Its kind, with the channels where these are accelerometers."""
+        return self.kind if self.channels == GYROS else f"accelerometer {self.kind}"
 
     @property
     def words(self) -> str:
         """Title: kind, size with unit, other numbers."""
         size = "" if self.size is None else f" {self.size:g} {self.unit}".rstrip()
-        return f"{self.kind}{size}{self.family.removeprefix(self.kind)}"
+        return f"{self.called}{size}{self.family.removeprefix(self.called)}"
 
     def fault(self, channel: str, start: float, sign: float, seed: int) -> Fault:
         """Return the fault on a channel from a time on, s, with a sign if the kind allows one."""
@@ -99,12 +116,16 @@ class Swept:
 def parse_swept(text: str) -> tuple[Swept, ...]:
     """Read the faults of a sweep: ``kind=bias size=0.05,0.1,0.3`` gives one entry per size.
 
+    ``channel=accelerometers`` strikes these instead of the gyros, with sizes in m/s^2.
     `FaultError` if the form is wrong, or a number does not fit its kind.
     """
     items = key_values(text)
-    if chosen := [
-        name for name in items if name in ("channel", "start", "stop", "seed")
-    ]:
+    channels = items.pop("channel", GYROS)
+    if channels not in (GYROS, FORCES):
+        raise FaultError(
+            f"fault {text!r}: channel is {channels!r}, expected {GYROS} or {FORCES}: a sweep strikes each of them"
+        )
+    if chosen := [name for name in items if name in ("start", "stop", "seed")]:
         raise FaultError(f"fault {text!r}: {chosen[0]} is chosen by the sweep")
     kind = items.pop("kind", "")
     if kind in FAULT_KINDS and FAULT_KINDS[kind].whole_unit:
@@ -113,7 +134,7 @@ def parse_swept(text: str) -> tuple[Swept, ...]:
         )
     sizes = items.pop("size", "").split(",")
     found = tuple(
-        Swept(kind, (*([("size", size)] if size else []), *items.items()))
+        Swept(kind, (*([("size", size)] if size else []), *items.items()), channels)
         for size in dict.fromkeys(sizes)
     )
     for one in found:
@@ -239,10 +260,12 @@ class Onset:
     """Start time, s from the first sample."""
     origin: int
     """Stamp of the first sample, ns."""
-    core: NDArray[Any]
-    """(1,) `fdi_ros.core.records.Core`."""
+    cores: list[NDArray[Any]]
+    """(1,) `fdi_ros.core.records.Core` of the gyros, and of the accelerometers if any."""
     states: list[dict[int, NDArray[Any]]]
-    """Memory of each detector by the bits of the set of channels."""
+    """Memory of each detector by the bits of the set of channels, of both halves."""
+    felt: tuple[int, ...]
+    """Units whose accelerometers are judged."""
     block: Block
     """Samples from shortly before the onset to the end of the detection time."""
     row: int
@@ -272,9 +295,15 @@ def onsets_of(
         rows = _rows_at(block, at, watch)
         walk.take(block[done : rows.start])
         done, first = rows.start, max(0, rows.start - lead)
-        states = [_memory_of(detector) for detector in pipeline.detectors]
+        cores = [half.core.copy() for half in pipeline.halves]
+        states = [_memory_of(detector) for detector in _detectors(pipeline)]
         part, row = block[first : rows.stop], rows.start - first
-        yield Onset(at, int(block.stamp[0]), pipeline.core.copy(), states, part, row)
+        yield Onset(at, int(block.stamp[0]), cores, states, pipeline.felt, part, row)
+
+
+def _detectors(pipeline: Pipeline) -> list[Detector]:
+    """Return the detectors of both halves."""
+    return [detector for half in pipeline.halves for detector in half.detectors]
 
 
 def _memory_of(detector: Detector) -> dict[int, NDArray[Any]]:
@@ -291,7 +320,8 @@ def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
 
     The monitor must have the same settings. Its own memory is overwritten.
     """
-    for detector, states in zip(pipeline.detectors, onset.states, strict=True):
+    pipeline.sense(onset.felt)
+    for detector, states in zip(_detectors(pipeline), onset.states, strict=True):
         # Sets that were used later only are reset.
         detector.states[: int(detector.bank["rows"][0])] = np.zeros(
             (), dtype=detector.states.dtype
@@ -299,7 +329,8 @@ def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
         for mask, state in states.items():
             detector.prepare(mask)
             detector.states[int(detector.bank["row"][0, mask])] = state
-    pipeline.core[:] = onset.core
+    for half, core in zip(pipeline.halves, onset.cores, strict=True):
+        half.core[:] = core
     injected = Injector([fault], pipeline.channel_names, onset.origin).apply(
         onset.block
     )
@@ -309,6 +340,7 @@ def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
 def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[Trial]:
     """Inject each fault separately into one channel at one time."""
     pipeline = monitor_of(config)
+    pipeline.sense(onset.felt)
     name, stamp = pipeline.channel_names[channel], onset.block.stamp[onset.row :]
     # Times count from the first faulty sample.
     since, start = (
@@ -316,7 +348,10 @@ def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[T
         float((stamp[0] - onset.origin) * 1e-9),
     )
     trials = []
+    struck = FORCES if channel >= pipeline.geometry.n else GYROS
     for swept in plan.faults:
+        if swept.channels != struck:
+            continue
         rng = np.random.default_rng(
             [plan.seed, zlib.crc32(f"{name} {swept.family} {onset.at:.6f}".encode())]
         )
@@ -339,7 +374,7 @@ def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[T
 @lru_cache(maxsize=2)
 def monitor_of(config: Config) -> Pipeline:
     """Return the monitor of a config, which is built once in each process."""
-    return Pipeline(config.replaced({"accelerometers.enabled": "off"}))
+    return Pipeline(config)
 
 
 # All faults with all monitors
@@ -355,6 +390,10 @@ class Subject:
     channels: tuple[
         str, ...
     ] = ()  # names of all channels; those excluded are tried with no fault
+    gyros: int = 0
+    """Number of the channels that are gyros, the first ones."""
+    felt: tuple[int, ...] = ()
+    """Units whose accelerometers are judged."""
     baseline: Baseline | None = None
     """Result without faults. None: the monitor does not run."""
     refused: str = ""
@@ -377,6 +416,11 @@ class Subject:
             if name not in self.config.excluded_channels
         )
 
+    def struck(self, swept: Swept) -> tuple[int, ...]:
+        """Channels that a fault is tried on."""
+        forces = swept.channels == FORCES
+        return tuple(i for i in self.used if (i >= self.gyros) == forces)
+
 
 def sweep(
     subjects: Sequence[Subject],
@@ -398,6 +442,10 @@ def sweep(
     ]
     if not baselines:
         raise FaultError(f"no fault can be tried: {subjects[0].refused}")
+    if not any(one.struck(swept) for one, _ in baselines for swept in plan.faults):
+        raise FaultError(
+            "no fault can be tried: all are of accelerometers, and none are judged in this recording"
+        )
     times = _times([baseline for _, baseline in baselines], baselines[0][0].block, plan)
     lead = max(
         [
@@ -413,12 +461,14 @@ def sweep(
     for one, baseline in baselines:
         _take_times(one, baseline, times, plan.within)
         pipeline = monitor_of(one.config)
+        pipeline.sense(one.felt)
         pipeline.restart()
         onsets = onsets_of(pipeline, one.block, one.times, plan.within, lead)
         owned += [
             (one, (one.config, onset, channel, plan))
             for onset in onsets
             for channel in one.used
+            if any(channel in one.struck(swept) for swept in plan.faults)
         ]
     found: dict[int, list[Trial]] = {}
     for done, (k, trials) in enumerate(
@@ -436,8 +486,14 @@ def _watch(one: Subject) -> None:
     """Judge the recording without faults, or store why this is not possible."""
     try:
         one.channels = build_geometry(one.config).channel_names
+        one.gyros = len(one.channels)
         pipeline = monitor_of(one.config)
         pipeline.restart()
+        if one.config.has_units and one.config.accelerometers.enabled == "auto":
+            # The monitor may have been built for another recording.
+            pipeline.sense(felt_units(one.block))
+        one.block = pipeline.arranged(one.block)
+        one.felt, one.channels = pipeline.felt, pipeline.channel_names
         one.baseline = watch_baseline(pipeline, one.block)
         one.refused = (
             ""

@@ -83,6 +83,9 @@ def lines_of(tried: Subject, plan: Plan, channel: int | None = None) -> list[Lin
     """Sum up by kind and size, over all channels or for one."""
     lines = []
     for swept in plan.faults:
+        struck = tried.struck(swept)
+        if not struck or (channel is not None and channel not in struck):
+            continue
         scored = [
             one.scored
             for one in tried.trials
@@ -202,6 +205,7 @@ def _line_figures(line: Line) -> dict[str, Any]:
     """Return the results for a fault."""
     return {
         "kind": line.swept.kind,
+        "channels": line.swept.channels,
         **{name: float(value) for name, value in line.swept.items},
         "faults": line.trials,
         "named": asdict(line.isolated) if line.trials else None,
@@ -403,11 +407,22 @@ def _as_they_are(results: Sequence[Subject], plan: Plan) -> list[Section]:
         Section(f"{one.name}, nothing injected", "", sound_lines(one))
         for one in results
     ]
-    lines = {one.name: lines_of(one, plan) for one in results if one.trials}
+    lines = {
+        one.name: {line.swept: line for line in lines_of(one, plan)}
+        for one in results
+        if one.trials
+    }
     if len(lines) > 1:
         rows = [
-            (swept.words, *(_in_short(own[k]) for own in lines.values()))
-            for k, swept in enumerate(plan.faults)
+            (
+                swept.words,
+                *(
+                    _in_short(own[swept]) if swept in own else "-"
+                    for own in lines.values()
+                ),
+            )
+            for swept in plan.faults
+            if any(swept in own for own in lines.values())
         ]
         sections.append(Section("Side by side", SHORT_HINT, (("fault", *lines), rows)))
     return sections
@@ -430,7 +445,7 @@ def sweep_page(
     tried = [one for one in results if one.trials]
     sections = [*_as_they_are(results, plan), *_curves(tried, plan)]
     for one in tried:
-        sections += [_map(one, plan), figures_section(one, plan)]
+        sections += [*_maps(one, plan), figures_section(one, plan)]
     sections += [Section("Notes", "", HINTS), Section("What was run", "", about)]
     return page(f"fdi_ros: faults detected in {bag}", _summary(results, plan), sections)
 
@@ -516,16 +531,24 @@ def _figure(
     return {"data": data, "layout": {"xaxis": xaxis, "yaxis": yaxis, "height": 360}}
 
 
-def _map(one: Subject, plan: Plan) -> Section:
-    """Draw the share that is found, by channel and fault."""
-    rows = [lines_of(one, plan, channel) for channel in one.used]
-    found = [[round(line.detected.value, 2) for line in lines] for lines in rows]
-    names, words = (
-        [one.channels[channel] for channel in one.used],
-        [line.swept.words for line in rows[0]],
-    )
-    heat = {"type": "heatmap", "z": found, "x": words, "y": names}
+def _maps(one: Subject, plan: Plan) -> list[Section]:
+    """Draw the share detected by channel and fault, for gyros and for accelerometers."""
     hint = "Share of the faults that were detected, by channel and fault: isolated, or one of a set."
-    return Section(
-        f"{one.name}, every channel", hint, "", [{"data": [heat], "layout": {}}]
-    )
+    halves = {
+        "every channel": [i for i in one.used if i < one.gyros],
+        "every accelerometer": [i for i in one.used if i >= one.gyros],
+    }
+    sections = []
+    for title, channels in halves.items():
+        rows = [lines_of(one, plan, channel) for channel in channels]
+        if not rows or not rows[0]:
+            continue
+        heat = {
+            "type": "heatmap",
+            "z": [[round(line.detected.value, 2) for line in lines] for lines in rows],
+            "x": [line.swept.words for line in rows[0]],
+            "y": [one.channels[channel] for channel in channels],
+        }
+        figure = {"data": [heat], "layout": {}}
+        sections.append(Section(f"{one.name}, {title}", hint, "", [figure]))
+    return sections

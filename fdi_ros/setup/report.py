@@ -48,7 +48,15 @@ from fdi_ros.setup.channels import UNMEASURED, ChannelFit
 from fdi_ros.setup.estimate import SHOWN_DELAY
 from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.positions import SHOWN_POSITION
-from fdi_ros.setup.run import SIZES, TIMES, WITHIN, SetupResult, Tried, times_words
+from fdi_ros.setup.run import (
+    FORCE_SIZES,
+    SIZES,
+    TIMES,
+    WITHIN,
+    SetupResult,
+    Tried,
+    times_words,
+)
 from fdi_ros.system.text import LINE, first_of, shown
 
 #: uncertainty of the axes along a direction of the body from which they are not well
@@ -750,6 +758,24 @@ def _tried(found: SetupResult, unit: Unit = RADIANS) -> list[Column]:
         for one in both
     ]
     heads = [f"{size * unit.factor:.3g} {unit.name} isolated" for size in SIZES]
+
+    def share_words(share: tuple[int, int]) -> str:
+        return f"{share[0]} of {share[1]}" if share[1] else "-"
+
+    forces = []
+    if any(one.forces for one in both):
+        shares_of_forces = [
+            [one.forces.get(size, (0, 0)) for size in FORCE_SIZES] for one in both
+        ]
+        heads_of_forces = [f"{size:.3g} {FORCES.name} isolated" for size in FORCE_SIZES]
+        figures = [
+            [{"size": s, "isolated": n, "tried": m} for s, (n, m) in one.forces.items()]
+            for one in both
+        ]
+        forces = [
+            Column("accelerometers_isolated", figures),
+            Column("", shares_of_forces, heads_of_forces, share_words),
+        ]
     return [
         Column("", ("before", "new"), ("settings",)),
         Column("", declared, ("declared",)),
@@ -760,8 +786,9 @@ def _tried(found: SetupResult, unit: Unit = RADIANS) -> list[Column]:
             "",
             shares,
             heads,
-            lambda share: f"{share[0]} of {share[1]}" if share[1] else "-",
+            share_words,
         ),
+        *forces,
     ]
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +37,15 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import OutcomeKind
-from fdi_ros.replay.sweep import Baseline, Plan, Subject, parse_swept, sweep
+from fdi_ros.replay.sweep import (
+    FORCES,
+    GYROS,
+    Baseline,
+    Plan,
+    Subject,
+    parse_swept,
+    sweep,
+)
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.calibrate import (
@@ -51,8 +59,9 @@ from fdi_ros.setup.calibrate import (
 from fdi_ros.setup.mounting import Mounting, assess
 from fdi_ros.system.text import first_of, shown
 
-#: biases tried, rad/s
+#: biases of gyros tried, rad/s, and of accelerometers, m/s^2
 SIZES = (0.03, 0.1, 0.3)
+FORCE_SIZES = (0.3, 1.0, 3.0)
 #: s in which they are to be isolated, and how often each is tried
 WITHIN, TIMES = (
     4.0,
@@ -77,6 +86,8 @@ class Tried:
     note: str
     #: by size, rad/s: biases isolated and tried; empty if the recording is too short
     isolated: dict[float, tuple[int, int]]
+    #: the same of accelerometers, m/s^2; empty also without any
+    forces: dict[float, tuple[int, int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.judged = (
@@ -137,10 +148,10 @@ class Proof:
 
 def _tried(block: Block, config: Config) -> Tried:
     """Replay a recording without and with test biases."""
+    faults = [f"kind=bias size={size:g}" for size in SIZES]
+    faults += [f"channel={FORCES} kind=bias size={size:g}" for size in FORCE_SIZES]
     plan = Plan(
-        tuple(one for size in SIZES for one in parse_swept(f"kind=bias size={size:g}")),
-        TIMES,
-        WITHIN,
+        tuple(one for text in faults for one in parse_swept(text)), TIMES, WITHIN
     )
     one = Subject("settings", config, block)
     try:
@@ -151,14 +162,17 @@ def _tried(block: Block, config: Config) -> Tried:
         return Tried(
             baseline if baseline.judged else None, baseline.note or str(error), {}
         )
-    # Where a channel stands declared without a fault, nothing is tried, and nothing would be found.
-    missed, isolated = len(one.skipped) * len(one.used), {}
-    for size in SIZES:
+    halves: dict[str, dict[float, tuple[int, int]]] = {GYROS: {}, FORCES: {}}
+    for swept in plan.faults:
         outcomes = [
-            trial.scored.outcome for trial in one.trials if trial.swept.size == size
+            trial.scored.outcome for trial in one.trials if trial.swept == swept
         ]
-        isolated[size] = outcomes.count(OutcomeKind.ISOLATED), len(outcomes) + missed
-    return Tried(one.baseline, one.refused, isolated)
+        # Where a channel stands declared without a fault, nothing is tried, and nothing would be found.
+        tried = len(outcomes) + len(one.skipped) * len(one.struck(swept))
+        if tried:
+            found = outcomes.count(OutcomeKind.ISOLATED)
+            halves[swept.channels][swept.size or 0.0] = found, tried
+    return Tried(one.baseline, one.refused, halves[GYROS], halves[FORCES])
 
 
 Parameters = dict[str, object]
