@@ -74,6 +74,7 @@ from fdi_ros.estimator.noise import (
     THREE_SIGMA,
     begin_noise,
     change_regime,
+    follow_loudness,
     update_largest_rate,
     update_sample_variance,
     update_unknown,
@@ -164,6 +165,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     update_largest_rate(
         noise, kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
     )
+    follow_loudness(noise, n, params.louder, kf.span)
     update_unknown(noise, n, kf.span)
     update_sample_variance(
         noise,
@@ -434,6 +436,9 @@ class Sequential(Detector):
     gain_odds
         Prior odds of a wrong gain of a unit, against those of gyros. Gravity lets the gain of
         an accelerometer always show, as an error of the vertical one.
+    louder
+        Noise variance of a channel over its largest before, from which its slow noise is
+        learned anew.
     """
 
     name = "sequential"
@@ -454,6 +459,7 @@ class Sequential(Detector):
         bias_walk: float | Sequence[float] = 5e-5,
         delay_std: float = 0.001,
         gain_odds: float = 1.0,
+        louder: float = math.inf,
     ) -> None:
         if not 0.5 < confidence < 1:
             raise ConfigError(
@@ -474,6 +480,7 @@ class Sequential(Detector):
                 "bias_walk": float(walk.max()),
                 "delay_std": delay_std,
                 "gain_odds": gain_odds,
+                "louder": louder,
             },
         )
         params, n, noise = self.constants[0], geometry.n, self.noise
@@ -509,6 +516,7 @@ class Sequential(Detector):
             noise.nonlinearity_std, LEAST_NONLINEARITY
         )
         params["gain_odds"] = math.log(gain_odds)
+        params["louder"] = louder
         params["rest_std"] = REST_STD
         used = all_sets(n)
         singular = np.linalg.svd(used[:, :, None] * geometry.axes, compute_uv=False)

@@ -106,6 +106,8 @@ class Noise:
     seen: Four  # values of each time scale so far
     quick: Channels  # variance over the last half second, over the learned one
     unknown: Channels  # by how much the variance of long times may still be larger
+    loudest: Channels  # largest variance of a sample so far, (rad/s)^2
+    since: Channels  # time since it became much larger than any before, s
     last: ByScale  # statistics before
     apart: Apart  # of quarters, of the last second
     wild: ByScale  # values that were wild, and back at once
@@ -182,6 +184,7 @@ def begin_noise(noise: Noise, n: int, expected: Array) -> None:
         noise.quick[i] = noise.square[i] = noise.share[i] = 1.0
         noise.squares[0, i] = noise.squares[1, i] = 1.0
         noise.unknown[i] = 1.0 + UNKNOWN
+        noise.loudest[i] = expected[i]
         noise.degrees[i] = TRUST
         noise.neighbours[i] = 1.0 + 0.5 / (TRUST - 3.0)
     update_longest(noise, n)
@@ -414,11 +417,22 @@ def update_largest_rate(noise: Noise, square: float) -> None:
 
 
 @compiled
+def follow_loudness(noise: Noise, n: int, louder: float, seconds: float) -> None:
+    """Begin to learn the slow noise of a channel anew where it is ``louder`` times as loud as ever before."""
+    for i in range(n):
+        noise.since[i] += seconds
+        variance = noise.now.sample[i] * max(1.0, BURST * noise.quick[i])
+        if variance > louder * noise.loudest[i]:
+            noise.loudest[i], noise.since[i] = variance, 0.0
+
+
+@compiled
 def update_unknown(noise: Noise, n: int, seconds: float) -> None:
     """Update how much larger slow noise may still be: unknown at first, and for longer where noise is coloured."""
     noise.lived[noise.regime] += seconds
     lived = noise.lived[noise.regime]
     for i in range(n):
+        known = min(lived, noise.since[i])
         noise.unknown[i] = 1.0 + UNKNOWN / (
-            1.0 + 0.25 * lived * lived / noise.longest[i]
+            1.0 + 0.25 * known * known / noise.longest[i]
         )

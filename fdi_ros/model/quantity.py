@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 
@@ -21,8 +22,11 @@ class Quantity(NamedTuple):
     gain_odds: float
     """Prior odds that the gain of a unit changes, against those of a gyro. Gravity makes any
     change of the gain of accelerometers look like an error of the vertical one."""
+    louder: float
+    """Noise variance over the largest before from which slow noise is unknown anew. Vibration
+    moves an accelerometer itself: what it rectifies and folds down comes with its noise."""
 
 
-RATE = Quantity("gyro", "rad/s", 1.0, 1.0)
+RATE = Quantity("gyro", "rad/s", 1.0, 1.0, math.inf)
 #: 150 m/s^2 for 1 rad/s: then nothing is declared in thirty vibrating flights
-FORCE = Quantity("accelerometer", "m/s^2", 150.0, 0.01)
+FORCE = Quantity("accelerometer", "m/s^2", 150.0, 0.01, 16.0)

@@ -158,6 +158,7 @@ def _build(
         "bias_walk": config.noise.bias_walk,
         "delay_std": delay_std,
         "gain_odds": quantity.gain_odds,
+        "louder": quantity.louder,
     }
     options |= {option: value for option, value in errors.items() if option in accepted}
     # The paper's tolerance keeps no false-alarm rate, and refuses to be given one.
