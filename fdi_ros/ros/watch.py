@@ -26,6 +26,7 @@ from sensor_msgs.msg import Imu
 
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.errors import FdiError
+from fdi_ros.model.quantity import FORCE, RATE
 from fdi_ros.monitor.diagnostics import INPUT, WHOLE, Level, StatusLine, parse_number
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.ros.node import read_diagnostics
@@ -61,7 +62,7 @@ COLOURS = {
 }
 GREY = "bright_black"
 SCALES = tuple(digit * 10.0**power for power in range(-2, 3) for digit in (2, 5, 10))
-"""Ends of a residual bar, rad/s. The least is above the noise of healthy channels."""
+"""Ends of a residual bar, in the unit of the channel. The least is above the noise of healthy channels."""
 LATEST = 8  # changes of state that are drawn
 WIDE = 90  # columns from which the biases have room
 
@@ -471,28 +472,53 @@ def _figure_table(picture: Picture) -> Table:
 
 
 def _channel_table(picture: Picture, is_wide: bool) -> Table:
-    """Draw one row per channel: state, residual, and the bias if the width allows."""
+    """Draw one row per channel: state, residual, and the bias if the width allows.
+
+    Gyros come first, then accelerometers, each with a scale in their own unit.
+    """
     is_fresh, columns = not picture.is_silent("diagnostics"), 5 if is_wide else 4
+    longest = max(len(shown(name)) for name in picture.channels)
+    table = _grid((longest, 9, None, 9, 18)[:columns])
+    for unit in (RATE.unit, FORCE.unit):
+        lines = {
+            name: line
+            for name, line in picture.channels.items()
+            if _unit_of(line) == unit
+        }
+        if lines:
+            for cells in _channel_rows(lines, unit, is_fresh):
+                table.add_row(*cells[:columns])
+    return table
+
+
+def _unit_of(line: StatusLine) -> str:
+    """Return the unit of a channel: names of its values end with it."""
+    has_force = any(name.endswith(f"({FORCE.unit})") for name, _ in line.values)
+    return FORCE.unit if has_force else RATE.unit
+
+
+def _channel_rows(
+    lines: Mapping[str, StatusLine], unit: str, is_fresh: bool
+) -> Iterator[Sequence[Text | Bar | str]]:
+    """Yield the heads, then a row for each channel."""
     residuals = {
-        name: line.number("residual (rad/s)") for name, line in picture.channels.items()
+        name: line.number(f"residual ({unit})") for name, line in lines.items()
     }
     sizes = {
         name: abs(value) if math.isfinite(value) else 0.0
         for name, value in residuals.items()
     }
-    scale = next(
-        (scale for scale in SCALES if scale >= max(sizes.values())), SCALES[-1]
-    )
-    table = _grid((max(len(shown(name)) for name in sizes), 9, None, 9, 18)[:columns])
+    largest = max(sizes.values())
+    scale = next((scale for scale in SCALES if scale >= largest), SCALES[-1])
     heads = (
         "channel",
         "state",
-        f"residual, to {scale:g} rad/s",
-        "rad/s",
-        "bias, rad/s",
+        f"residual, to {scale:g} {unit}",
+        unit,
+        f"bias, {unit}",
     )
-    table.add_row(*(Text(word, style=GREY) for word in heads[:columns]))
-    for name, line in picture.channels.items():
+    yield [Text(word, style=GREY) for word in heads]
+    for name, line in lines.items():
         # A string would be taken for markup.
         cells: list[Text | Bar | str] = [
             Text(shown(name)),
@@ -507,18 +533,13 @@ def _channel_table(picture: Picture, is_wide: bool) -> Table:
                 scale, 0.0, min(sizes[name], scale), color=colour.removeprefix("bold ")
             )
             figure = f"{residual:+.4f}" if math.isfinite(residual) else "none"
-            cells[1:] = [
-                Text(line.value("state"), style=colour),
-                bar,
-                figure,
-                _format_bias(line),
-            ]
-        table.add_row(*cells[:columns])
-    return table
+            state = Text(line.value("state"), style=colour)
+            cells[1:] = [state, bar, figure, _format_bias(line, unit)]
+        yield cells
 
 
-def _format_bias(line: StatusLine) -> str:
-    bias, std = line.number("bias (rad/s)"), line.number("bias known to (rad/s)")
+def _format_bias(line: StatusLine, unit: str) -> str:
+    bias, std = line.number(f"bias ({unit})"), line.number(f"bias known to ({unit})")
     known = f" +- {std:.4f}" if math.isfinite(std) else ""
     return f"{bias:+.4f}{known}" if math.isfinite(bias) else "none"
 

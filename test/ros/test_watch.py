@@ -108,6 +108,27 @@ def test_no_line_is_wider_than_the_terminal_and_no_word_is_cut(
     assert 0.6 * room < row.count("█") + 1 < 0.9 * room + 1
 
 
+def test_accelerometers_have_a_scale_and_figures_in_their_own_unit(
+    picture: Picture,
+) -> None:
+    values = (("state", "OK"), ("residual (m/s^2)", "1.5"), ("bias (m/s^2)", "0.25"))
+    force = StatusLine(Level.OK, "imu_1.accel_x", "agrees", values=values)
+    picture.update_channels({**picture.channels, "imu_1.accel_x": force})
+    lines = drawn(picture, 120)
+    (gyros, forces) = [line for line in lines if line.startswith("channel")]
+    assert "residual, to 0.2 rad/s" in gyros
+    assert "residual, to 2 m/s^2" in forces
+    assert "bias, m/s^2" in forces
+    (row,) = [line for line in lines if line.startswith("imu_1.accel_x")]
+    assert row.split("+1.5000")[1].split() == ["+0.2500"]
+    assert lines.index(forces) > max(
+        k for k, line in enumerate(lines) if line.startswith("imu_4.z")
+    )
+    # The rows of the gyros are as they were without accelerometers.
+    (faulty,) = [line for line in lines if line.startswith("imu_2.y")]
+    assert "-0.1490" in faulty
+
+
 def test_what_is_no_longer_said_is_not_shown_as_what_is(picture: Picture) -> None:
     picture.heard = {}
     lines = drawn(picture, 80)
