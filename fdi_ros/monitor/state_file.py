@@ -1,10 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Biases and declarations of the gyros that outlive the process, in one small file.
-
-Those of the accelerometers are found anew at each start.
-"""
+"""Biases and declarations of gyros and accelerometers that outlive the process, in one small file."""
 
 from __future__ import annotations
 
@@ -30,6 +27,7 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.delays import LONGEST_DELAY
 from fdi_ros.estimator.error_states import predict
 from fdi_ros.model.samples import Array
+from fdi_ros.monitor.accelerometers import possible_units
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.system.files import DistrustError, open_regular, read_trusted, replacing
 
@@ -93,6 +91,14 @@ def _content(pipeline: Pipeline) -> dict[str, Any]:
     }
 
 
+def _whole_content(pipeline: Pipeline) -> dict[str, Any]:
+    """Return the lasting state of gyros and accelerometers; that of the latter in units of `FORCE.natural`."""
+    other = pipeline.accelerometers
+    felt = {"units": list(pipeline.felt)}
+    accelerometers = None if other is None else {**_content(other), **felt}
+    return {**_content(pipeline), "accelerometers": accelerometers}
+
+
 def _errors(detector: Detector) -> dict[str, Array] | None:
     """Return the estimates of ``ERROR_KINDS``, (N,), (N, N), and corrected delays, s, or None."""
     if not detector.states[0]["begun"]:
@@ -114,9 +120,13 @@ def _as_json(figures: Array) -> list[float]:
 
 def _differs(state: dict[str, Any], kept: dict[str, Any] | None) -> bool:
     """Whether a state is to be saved, with another one kept: estimated errors always change a little."""
-    if kept is None or any(
-        state[name] != kept[name] for name in state.keys() - {"errors"}
-    ):
+    if kept is None:
+        return True
+    own = state.keys() - {"errors", "accelerometers"}
+    if any(state[name] != kept[name] for name in own):
+        return True
+    other = state.get("accelerometers")
+    if other is not None and _differs(other, kept["accelerometers"]):
         return True
     now, then = state["errors"], kept["errors"]
     if now is None or then is None:
@@ -177,6 +187,23 @@ def _parsed(saved: Any, pipeline: Pipeline) -> dict[str, Any]:
         settings,
     )
     return state
+
+
+def _parsed_accelerometers(
+    saved: Any, pipeline: Pipeline
+) -> tuple[Pipeline, dict[str, Any]]:
+    """Return the monitor of the accelerometers that were judged, and their state in a file's content.
+
+    They are judged once samples show the same units. Errors as of `_parsed`.
+    """
+    units = tuple(map(int, saved["units"]))
+    if not set(units) <= set(possible_units(pipeline.config, pipeline.geometry.n)):
+        raise ValueError
+    half = pipeline.build_accelerometers(units)
+    try:
+        return half, _parsed(saved, half)
+    except RefusalError:
+        raise RefusalError("biases of accelerometers are not plausible") from None
 
 
 def _parsed_errors(saved: Any, detector: Detector) -> dict[str, Array]:
@@ -373,7 +400,7 @@ class StateFile:
 
     def save(self, pipeline: Pipeline) -> bool:
         """Write a changed state, whole or not at all. Return whether a write was tried."""
-        state = _content(pipeline)
+        state = _whole_content(pipeline)
         if not _differs(state, self._kept) or time.monotonic() < self._not_before:
             return False
         about = {
@@ -417,14 +444,19 @@ class StateFile:
             raise RefusalError(
                 f"saved {age:.0f} s ago, expected at most {self.max_age:g} s (state_max_age)"
             )
-        state = _parsed(saved, pipeline)
-        _restore(state, pipeline, age)
+        parts = [(pipeline, _parsed(saved, pipeline))]
+        if given := saved.get("accelerometers"):
+            parts.append(_parsed_accelerometers(given, pipeline))
+        for half, state in parts:
+            _restore(state, half, age)
+        state = parts[0][1]
         restored = ["biases"] if state["bias"] is not None else []
         restored += [
             f"{name} {kind.upper()}"
-            for kind, names in state["declared"].items()
+            for _, part in parts
+            for kind, names in part["declared"].items()
             for name in names
         ]
         what = ", ".join(restored) or "nothing to restore"
         self.words = f"state of {age:.0f} s ago taken from {self.path}: {what}"
-        self._kept = _content(pipeline)
+        self._kept = _whole_content(pipeline)

@@ -259,13 +259,33 @@ def test_accelerometers_may_be_excluded_and_the_detector_changed_under_way():
     assert pipeline.config is before
 
 
-def test_the_state_file_keeps_the_gyros(tmp_path):
-    pipeline, (block, _) = Pipeline(settings()), flight(200)
-    pipeline.process(block)
-    assert len(pipeline.channel_names) == 18
-    assert StateFile(tmp_path / "state", 60.0).save(pipeline)
-    again = Pipeline(settings())
-    assert StateFile(tmp_path / "state", 60.0).restore(again)
+@pytest.mark.parametrize("enabled", ["auto", "on"])
+def test_the_state_file_keeps_gyros_and_accelerometers(tmp_path, enabled):
+    config = settings(accelerometers__enabled=enabled)
+    pipeline, (block, _) = Pipeline(config), flight(1000, bias=0.3)
+    pipeline.sense(range(3))
+    fault = "channel=imu_2.accel_y kind=bias size=3 start=4"
+    block = struck(block, [fault], pipeline.channel_names)
+    pipeline.process(block[:900])
+    file = StateFile(tmp_path / "state", 60.0)
+    assert file.save(pipeline)
+    assert not file.save(pipeline)
+    again = Pipeline(config)
+    kept = StateFile(tmp_path / "state", 60.0)
+    assert kept.restore(again)
+    assert "imu_2.accel_y FAULTY" in kept.words
+    output = again.process(block[900:])
+    place = output.channel_names.index("imu_2.accel_y")
+    assert (output.state[:, place] == ChannelState.FAULTY).all()
+    assert not (np.delete(output.state, place, axis=1) == ChannelState.FAULTY).any()
+    before, after = (
+        one.accelerometers.guard.states[0]["estimator"]["states"]["x"][:9]
+        for one in (pipeline, again)
+    )
+    np.testing.assert_allclose(after, before, atol=0.1 / 150)
+    # Another monitor has other accelerometers.
+    other = Pipeline(settings(accelerometers__enabled="off"))
+    assert not StateFile(tmp_path / "state", 60.0).restore(other)
 
 
 def test_live_a_unit_without_accelerations_leaves_those_of_the_others_in_place():
