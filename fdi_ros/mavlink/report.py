@@ -241,15 +241,22 @@ class Announcer:
     ) -> None:
         self._raw_apart = apart
         self._units = [tuple(channels[k : k + 3]) for k in range(0, len(channels), 3)]
+        self._forces = {
+            f"{name.rpartition('.')[0]}.accel_{axis}": f"accelerometer {axis} of IMU {k + 1}"
+            for k, (name, *_) in enumerate(self._units)
+            for axis in "xyz"
+        }
+        """Accelerometers in words, by the names of their channels."""
         self._now: dict[str, tuple[str, str]] = {
-            **dict.fromkeys(channels, ("OK", "")),
+            **dict.fromkeys((*channels, *self._forces), ("OK", "")),
             WHOLE: ("", ""),
         }
         """State and set of each channel, and the trouble of the whole. Empty: none."""
         self._said = dict(self._now)  # the same as last announced
         self._apart = dict.fromkeys(channels, "")
         """Present difference of each channel and the other of its pair, rad/s."""
-        self._errors = dict.fromkeys(channels, math.inf)  # estimated, rad/s
+        # Estimated, rad/s, of an accelerometer m/s^2.
+        self._errors = dict.fromkeys((*channels, *self._forces), math.inf)
         self._heard = 0
         # Time of the first change since the last texts, ns.
         self._changed: int | None = None
@@ -275,6 +282,10 @@ class Announcer:
                 self._errors[line.name] = error if error > 0.0 else math.inf
                 group = line.value("one of") if state == "AMBIGUOUS" else ""
                 self._note(line.name, (state if state in _STATES else "OK", group), now)
+            elif line.name in self._forces:
+                # Sets, and what a whole unit lacks, stay in the diagnostics.
+                self._errors[line.name] = abs(line.number("estimated error (m/s^2)"))
+                self._note(line.name, (state if state == "FAULTY" else "OK", ""), now)
 
     def _note(self, name: str, found: tuple[str, str], now: int) -> None:
         if found != self._now[name]:
@@ -310,6 +321,8 @@ class Announcer:
         """Return whether the raw rates agree, though the monitor names channels of a unit."""
         if self._raw_apart is None or self._now[names[0]][0] != "FAULTY":
             return False
+        if names[0] in self._forces:
+            return False
         unit = next(k for k, one in enumerate(self._units) if names[0] in one)
         error = max(map(self._errors.__getitem__, names))
         return self._raw_apart(unit) < min(GRAVE, max(ROUNDED, error / 2))
@@ -344,6 +357,10 @@ class Announcer:
         if state == "AMBIGUOUS":
             return WARNING, self._set_text(group)
         severity, words = _STATES.get(state, (INFO, "agrees again"))
+        if names[0] in self._forces:
+            if state == "FAULTY" and self._errors[names[0]] > 0.0:
+                words = f"off by {self._errors[names[0]]:.1f} m/s^2"
+            return max(severity, WARNING), _fit(self._forces[names[0]], words)
         if state == "FAULTY" and max(map(self._errors.__getitem__, names)) < GRAVE:
             severity = WARNING
         who = names[0].rpartition(".")[0] if len(names) > 1 else names[0]

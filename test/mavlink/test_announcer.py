@@ -64,6 +64,28 @@ class Ground:
         return [(severity, text) for _, severity, text in self.told[before:]]
 
 
+def force(name: str, state: str, error: str = "") -> StatusLine:
+    """What a monitor reports of an accelerometer."""
+    values = (("state", state), ("estimated error (m/s^2)", error))
+    return StatusLine(Level.OK, name, "", values=values)
+
+
+@pytest.mark.parametrize("apart", [None, lambda unit: 0.0])
+def test_an_accelerometer_is_named_with_its_size_and_stays_a_warning(apart) -> None:
+    ground, name = Ground(apart=apart), "imu_2.accel_z"
+    assert (
+        ground.hear(force(name, "SUSPECT"), force("imu_1.accel_x", "AMBIGUOUS")) == []
+    )
+    text = "FDI: accelerometer z of IMU 2 off by 1.2 m/s^2"
+    assert ground.hear(force(name, "FAULTY", "-1.234")) == [(WARNING, text)]
+    assert ground.hear(force(name, "FAULTY", "-1.6")) == []
+    again = [] if apart else [(INFO, "FDI: accelerometer z of IMU 2 agrees again")]
+    assert ground.hear(force(name, "OK")) == again
+    unknown = [(WARNING, "FDI: accelerometer z of IMU 2 faulty")]
+    assert ground.hear(force(name, "FAULTY")) == unknown
+    assert len("FDI: accelerometer z of IMU 4 off by 156.9 m/s^2") <= LENGTH
+
+
 def test_declarations_are_told_and_suspicions_are_not() -> None:
     ground = Ground()
     assert ground.hear(report("imu_2.y", "SUSPECT")) == []
