@@ -5,6 +5,10 @@
 
 The monitor removes learned errors from the samples and remembers declarations. The raw
 comparison does neither and shows the present difference of the autopilot's own gyros.
+
+Two of three IMUs can be wrong alike: both stand still, or both are remembered as faulty. So
+they outvote the third only if they are trusted (`TRUSTED`), if their values change, and if
+the monitor has no doubt about them that it does not have about the third as well.
 """
 
 from __future__ import annotations
@@ -32,9 +36,7 @@ CLEAR = 0.5
 #: Share of the rate by which two healthy gyros may differ: scales of one type differ by up
 #: to 3 %, which is more than `CLEAR` in a turn of 17 rad/s.
 SCALE = 0.05
-SKEW = (
-    20 * MS
-)  #: Two IMUs may measure this far apart in time, ns: see `RawComparison.steps`.
+SKEW = 20 * MS  #: Two IMUs may measure this far apart in time, ns.
 QUICK = 50 * MS  #: All samples of this time must differ by `LARGE` or `CLEAR`, ns,
 FEWEST = 3  #: and this number of samples.
 SIZED = 4  #: Samples over which the size in a text is averaged: all after the onset.
@@ -137,8 +139,8 @@ class RawComparison:
     def steps(self, unit: int, count: int) -> Vector:
         """Return how far each axis of an IMU changed within `SKEW`, rad/s.
 
-        The largest change among the last count samples: what a healthy IMU that measures
-        this much earlier or later differs by.
+        The largest change among the last count samples. A healthy IMU that measures this
+        much earlier or later differs by as much.
         """
         rates = list(self._recent[unit])[-count - self._lag :]
         largest = [0.0, 0.0, 0.0]
@@ -227,8 +229,8 @@ class Evidence:
         self._sizes = [UNKNOWN] * count  # largest of late, by axis, rad/s
         # Doubts of the monitor that agreement has refuted. None: the IMU is not trusted.
         self._refuted: list[set[ChannelState] | None] = [None] * count
-        # Axes that are FAULTY or in a set, since when while the IMU agrees, ns, and those of them that
-        # have been so for `TRUSTED`.
+        # Axes that are FAULTY or in a set, since when the IMU has agreed despite of that,
+        # ns, and the axes for which that has lasted for `TRUSTED`.
         self._named: list[set[int]] = [set()] * count
         self._named_at = [0] * count
         self._outdated: list[set[int]] = [set()] * count

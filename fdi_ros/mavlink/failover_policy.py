@@ -23,7 +23,7 @@ Definitions
              our order
     held     wanted out of use
 
-`failover_evidence.Evidence` finds what is apart, named and blamed.
+`failover_evidence.Evidence` finds which IMUs are apart, named and blamed.
 
 Rules, in this order at each tick
     1. Held IMUs go back in use if the operator asks, if no other IMU is left in use,
@@ -34,7 +34,7 @@ Rules, in this order at each tick
        rule 4 puts it back.
     2. In flight, the worst bad IMU to which `objection` has nothing becomes held. At
        most ``limit`` IMUs are ours, without a limit all but one.
-    3. Orders are sent until the autopilot reports what is wanted. An order to take an
+    3. Orders are sent until the autopilot reports the wanted state. An order to take an
        IMU out is sent only while rule 2 holds, so also each repetition needs a sound
        other IMU whose "in use" was reported within `FRESH`.
     4. If the autopilot reports no IMU in use, all of ours go back.

@@ -1,10 +1,11 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The gyros of PX4 or ArduPilot over MAVLink as Imu topics, and the monitor's declarations back as STATUSTEXT.
+"""Gyros of PX4 or ArduPilot from MAVLink to Imu topics, declarations back as STATUSTEXT.
 
-Settings come from the parameter file of the monitor, so that both have the same units. Nothing that is sent commands
-the vehicle, but for `failover`, which sets which IMUs of an ArduPilot are in use.
+Settings come from the parameter file of the monitor, so both have the same units. Nothing
+that the node sends commands the vehicle, except `failover`: it sets which IMUs of an
+ArduPilot are in use.
 """
 
 from __future__ import annotations
@@ -58,20 +59,25 @@ NAMES = (
     "imu_1",
     "imu_2",
     "imu_3",
-)  # of units where the settings name none, each on the topic ``NAME/data_raw``
-WAIT = 0.02  # the link is waited for at most so long, and the executor gets its turn as often, s
-INJECTED = "_faulty"  # what the injector adds to the name of a topic: on the bench the monitor's inputs
-PARTING = 4.0  # so long the end waits on the ground for IMUs to be put back, s
-MOST_CALLS = 32  # callbacks of a turn of the executor
-_SEND_EVERY = 10_000_000  # what is to be sent is looked for so often, ns
+)  #: Names of units where the settings name none, on topics ``NAME/data_raw``.
+WAIT = 0.02  #: Longest wait for the link between two turns of the executor, s.
+INJECTED = (
+    "_faulty"  #: Suffix of topics of the injector, the monitor's inputs on a bench.
+)
+PARTING = 4.0  #: Longest wait at the end, on the ground, until IMUs are put back, s.
+MOST_CALLS = 32  #: Largest number of callbacks in a turn of the executor.
+_SEND_EVERY = 10_000_000  # interval at which due messages are sent, ns
 _LARGEST = (
     1 << 17
-)  # bytes of diagnostics that are looked at; a monitor of twelve channels sends 10 000
-_VALUE_EVERY = 450_000_000  # between two NAMED_VALUE_FLOAT of a name, ns
+)  # largest diagnostics that are read, bytes; twelve channels take 10 000
+_VALUE_EVERY = 450_000_000  # interval between two NAMED_VALUE_FLOAT of one name, ns
 
 
 class AutopilotNode(CheckedNode):
-    """Publishes the IMUs of an autopilot, one topic a unit; `FdiError` if a parameter is wrong."""
+    """Publishes the IMUs of an autopilot, one topic for each unit.
+
+    Raises `FdiError` if a parameter is wrong.
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__("mavlink_node", MAVLINK, subscribes=False, **options)
@@ -94,14 +100,14 @@ class AutopilotNode(CheckedNode):
         self._link_state = (
             0,
             self._link.trouble,
-        )  # how often it was opened, and why it is not open
+        )  # number of times opened, and the reason if it is not open
         self._ahead = system_ahead()
-        self._called = False  # whether the executor has found something to do
+        self._called = False  # whether the executor has run a callback
         channels = config.channel_names or [
             f"{name}.{axis}" for name in names for axis in "xyz"
         ]
         self._sends_values: bool = params["named_values"]
-        # In full, as it stands in diagnostics: without the first slash.
+        # Diagnostics have the full name without the first slash.
         self._monitor = expand_topic_name(
             params["monitor"], self.get_name(), self.get_namespace()
         ).lstrip("/")
@@ -171,7 +177,7 @@ class AutopilotNode(CheckedNode):
         self._sole = [
             heard.topic_name,
             *self._topics,
-        ]  # topics, remapped, that must have one publisher
+        ]  # topics, after remapping, that must have one publisher
         self.create_service(Trigger, "~/restore", self._on_restore)
         if not params["signing_key"]:
             self.get_logger().warning(
@@ -182,8 +188,8 @@ class AutopilotNode(CheckedNode):
         return Failover(self._vehicle, channels, settings, path, time.time)
 
     def live(self, stop: Stop) -> None:
-        """Wait for the link, pass on what came, and give the executor its turn, until stopped: all in one thread."""
-        # Its queues are bounded, whoever floods the diagnostics; the gyros do not come through it.
+        """Serve the link and the executor in turn, in one thread, until stopped."""
+        # The executor's queues are bounded, and gyros do not pass through them.
         executor = make_executor(self, "single")
         due = time.monotonic()
         try:
@@ -200,7 +206,7 @@ class AutopilotNode(CheckedNode):
             executor.remove_node(self)
 
     def _put_back(self) -> None:
-        """Before the end, on the ground, put back what is out of use by failover; in flight it stays out."""
+        """Put IMUs back before the end. In flight they stay out of use."""
         end = time.monotonic() + PARTING
         while (
             self._failover is not None
@@ -220,7 +226,7 @@ class AutopilotNode(CheckedNode):
     # The link -----------------------------------------------------------------------------------------------------
 
     def _turn(self) -> None:
-        """Take what has come over the link, and send what is due."""
+        """Take received messages, and send due ones."""
         self._receive()
         now = time.monotonic_ns()
         if now < self._due:
@@ -250,7 +256,7 @@ class AutopilotNode(CheckedNode):
             for sample in self._vehicle.feed(peer, data, now):
                 if self._failover is not None:
                     self._failover.feed(sample)
-                # By the time of the system.
+                # Topics have the time of the system.
                 stamp = sample.stamp + self._ahead
                 if sample.unit < len(self._units) and 0 <= stamp <= LAST_STAMP:
                     output, template = self._units[sample.unit]
@@ -261,7 +267,7 @@ class AutopilotNode(CheckedNode):
     def _on_diagnostics(self, data: bytes) -> None:
         self._called = True
         now, failover = time.monotonic_ns(), self._failover
-        # All nodes speak there: only what can be the monitor's is taken apart.
+        # All nodes publish here. Decode only messages that name the monitor.
         if len(data) > _LARGEST or f"{self._monitor}: ".encode() not in data:
             return
         try:
@@ -269,7 +275,7 @@ class AutopilotNode(CheckedNode):
                 deserialize_message(data, DiagnosticArray), self._monitor
             )
         except ValueError:
-            # Not the monitor's: it has no such level.
+            # The monitor has no such level.
             return
         whole = next((line for line in lines if line.name == WHOLE), None)
         due = (
@@ -295,7 +301,7 @@ class AutopilotNode(CheckedNode):
             if line.name.startswith(INPUT)
         ]
         if failover is not None and topics:
-            # A monitor that has other topics, or has them in another order, means other IMUs by its channels.
+            # With other topics, or another order, its channels are other IMUs.
             agrees = (
                 whole is not None
                 and whole.level != Level.STALE
@@ -307,10 +313,10 @@ class AutopilotNode(CheckedNode):
         self._called = True
         assert self._failover is not None
         now, count = time.monotonic_ns(), len(self.config.channel_names)
-        # Behind the gyros and the stamp stand the accelerometers, which are left alone.
+        # Accelerometers follow the gyros and the stamp, and are not used.
         announced = ChannelsSource.announced(*as_batch(data))
         _, values = ChannelsSource.parse(data, max(announced, count + 7))
-        # A second publisher is a stranger, a second monitor, or gives it rates that are not this autopilot's.
+        # A second publisher is an imitator, a second monitor, or another source of rates.
         self._failover.is_alone = all(
             self.count_publishers(topic) == 1 for topic in self._sole
         )
@@ -352,7 +358,7 @@ def encode_imu(template: ImuTemplate, stamp: int, sample: ImuSample) -> bytes:
     struct.pack_into(
         "<iI", template.bytes.data, ENCAPSULATION, *divmod(stamp, 1_000_000_000)
     )
-    # Unknown is a covariance of zeros (REP-145); the template says that there is no acceleration.
+    # A covariance of zeros is unknown (REP-145). The template marks acceleration as absent.
     values = (*sample.rate, *(0.0,) * 9, *sample.acceleration, 0.0)
     struct.pack_into("<16d", template.bytes.data, template.at, *values)
     return template.bytes.tobytes()
