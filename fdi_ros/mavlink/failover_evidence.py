@@ -45,7 +45,7 @@ ALIKE = 0.05  #: Two IMUs agree within this share of the odd one's difference, t
 TRUSTED = (
     2 * NS
 )  #: IMUs are trusted once all have agreed with each other for this time, ns.
-REPEATING = 100 * MS  #: A gyro that repeats one value for this time is stuck, ns,
+REPEATING = 5  #: A gyro that repeats one value in this number of samples is stuck,
 MOVED = 0.02  #: if the rate of another one has changed by this meanwhile, rad/s.
 #: States of channels that are a doubt.
 DOUBTS = {
@@ -97,8 +97,9 @@ class RawComparison:
         self._pairs: dict[tuple[int, int], deque[tuple[int, Vector]]] = {
             (j, k): deque(maxlen=256) for k in range(count) for j in range(k)
         }
-        # When the value of an IMU last changed, and the rates of all IMUs then.
-        self._changed: list[tuple[int, list[Vector]]] = [(-NS, [])] * count
+        # Samples since the value of an IMU changed, and the rates of all IMUs then.
+        self._same = [0] * count
+        self._beside = [[UNKNOWN] * count] * count
         self._stuck = [False] * count
 
     def feed(self, unit: int, stamp: int, rate: Vector) -> None:
@@ -106,13 +107,15 @@ class RawComparison:
         if unit >= len(self._last):
             return
         if rate != self._last[unit][1]:
-            self._changed[unit] = stamp, [last for _, last in self._last]
+            self._same[unit] = 0
+            self._beside[unit] = [last for _, last in self._last]
             self._stuck[unit] = False
+        self._same[unit] += 1
         self._last[unit] = stamp, rate
         self._recent[unit].append(rate)
-        for other, (since, rates) in enumerate(self._changed):
-            repeats = other != unit and rates and stamp - since >= REPEATING
-            if repeats and math.dist(rate, rates[unit]) > MOVED:
+        for other, beside in enumerate(self._beside):
+            moved = math.dist(rate, beside[unit]) > MOVED
+            if other != unit and self._same[other] >= REPEATING and moved:
                 self._stuck[other] = True
         for pair, rows in self._pairs.items():
             if unit not in pair:

@@ -161,6 +161,18 @@ def test_a_gyro_that_is_stuck_does_not_agree_in_hover() -> None:
     assert watched.run(2.0).step()[0].agreed is not None
 
 
+@pytest.mark.parametrize("lost", [4, 20])
+def test_an_imu_whose_samples_are_lost_is_not_stuck(lost: int) -> None:
+    raw = RawComparison(2, STEP)
+    for k in range(100):
+        rate = (math.sin(0.1 * k), 0.0, 0.0)
+        raw.feed(0, START + k * STEP, rate)
+        if not k % (lost + 1):
+            raw.feed(1, START + k * STEP, rate)
+        assert not raw.is_stuck(0)
+        assert not raw.is_stuck(1)
+
+
 # What is no steady error ------------------------------------------------------------------
 
 
