@@ -31,6 +31,7 @@ from fdi_ros.mavlink.protocol import ARDUPILOT, MS, NS, ImuSample
 from fdi_ros.mavlink.report import INFO, LENGTH, WARNING
 from fdi_ros.mavlink.vehicle import Vehicle
 from fdi_ros.monitor.diagnostics import Level
+from fdi_ros.system.clocks import Clocks
 
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
 READ_EVERY = 100 * MS  #: The parameters are read so often in flight, ns.
@@ -46,7 +47,9 @@ SIZING = 200 * MS  #: Longest wait of a text for the size of an error, ns.
 COUNTED = 5 * NS  #: Losses are counted over this time, ns.
 STEADY = 3 * NS  #: Readiness must have changed for this time to be announced, ns.
 BOOT_STEP = 3 * NS  #: A boot time that grows by more is another boot, ns.
-SAME_BOOT = 10.0  #: Largest difference of two Unix boot times of one boot, s.
+SAME_BOOT = 10.0  #: Largest difference of two times of one start of the autopilot, s.
+#: Two starts within this time are those of one power supply, s.
+POWERED_TOGETHER = 60.0
 
 
 class Failover:
@@ -62,8 +65,8 @@ class Failover:
         Settings of the policy.
     path
         File that keeps the IMUs out of use. Raises `ConfigError` if unusable.
-    seconds
-        Clock of this computer, Unix time, s.
+    clocks
+        Returns the clocks of this computer.
     """
 
     def __init__(
@@ -72,12 +75,12 @@ class Failover:
         channels: Sequence[str],
         settings: PolicySettings,
         path: Path,
-        seconds: Callable[[], float],
+        clocks: Callable[[], Clocks],
     ) -> None:
         self._vehicle = vehicle
         self._channels = channels
         self._settings = settings
-        self._seconds = seconds
+        self._clocks = clocks
         count = len(channels) // 3
         interval = round(NS / vehicle.settings.rate)
         #: Time of the monitor's last diagnostics with these IMUs, ns. 0: none, or others since.
@@ -147,9 +150,20 @@ class Failover:
                 self._announce(imu, condition)
         self._announce_out(now)
         self._announce_readiness(view, now)
-        booted = self._seconds() - (now - (self._booted or now)) / NS
-        if error := self._file.keep(Saved(self._system, self.out, booted), now):
+        if error := self._file.keep(self._saved(now), now):
             self._vehicle.events.append(error)
+
+    def _saved(self, now: int) -> Saved:
+        """Return the content of the file."""
+        clocks = self._clocks()
+        ago = (now - (self._booted or now)) / NS
+        return Saved(
+            system=self._system,
+            out=self.out,
+            booted=clocks.unix - ago,
+            after=clocks.uptime - ago,
+            computer=clocks.boot,
+        )
 
     def restore(self, now: int) -> tuple[bool, str]:
         """Put all IMUs back. Return whether the autopilot was asked, and an answer."""
@@ -181,14 +195,28 @@ class Failover:
             return
         booted = newest.last - newest.time
         if self._booted is None and self.out:
-            # The computer's clock and the autopilot's have gone on alike, or not.
-            unix = self._seconds() - (now - booted) / NS
-            if abs(unix - self._file.written.booted) > SAME_BOOT:
+            if not self._is_same_boot((now - booted) / NS):
                 self._boots += 1
         elif self._booted is not None and booted - self._booted > BOOT_STEP:
             self._boots += 1
             self._forget()
         self._booted = booted
+
+    def _is_same_boot(self, ago: float) -> bool:
+        """Return whether the autopilot has run since before the file was written.
+
+        The autopilot started ``ago`` seconds ago. Its clock and that of this computer have
+        gone on alike, or not. Unix time is compared only if this computer was started in
+        between, and not together with the autopilot: without a time source, Unix time may
+        begin at the same value after each power cut.
+        """
+        clocks = self._clocks()
+        saved = self._file.written
+        if clocks.boot and clocks.boot == saved.computer:
+            return abs(clocks.uptime - ago - saved.after) <= SAME_BOOT
+        if abs(clocks.uptime - ago) < POWERED_TOGETHER:
+            return False
+        return abs(clocks.unix - ago - saved.booted) <= SAME_BOOT
 
     def _forget(self) -> None:
         self._values = [(None, 0)] * len(self._values)

@@ -9,6 +9,7 @@ A thread writes, because a slow card may hold fsync for seconds while the link m
 from __future__ import annotations
 
 import json
+import math
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +26,9 @@ class Saved(NamedTuple):
     system: int = 0  #: System id of the autopilot. 0: none yet.
     out: tuple[int, ...] = ()  #: IMUs out of use by our orders, from 0.
     booted: float = 0.0  #: Unix time at which the autopilot started, s.
+    #: Time of the autopilot's start after that of this computer, s. NaN: unknown.
+    after: float = math.nan
+    computer: str = ""  #: Identity of that start of this computer. Empty: unknown.
 
 
 class FailoverFile:
@@ -62,8 +66,13 @@ class FailoverFile:
             out = tuple(int(imu) - 1 for imu in found["out_of_use"])
             if not set(out) <= set(range(count)):
                 raise ValueError
-            booted = float(found.get("autopilot_booted", 0.0))
-            return Saved(int(found["system_id"]), out, booted)
+            return Saved(
+                system=int(found["system_id"]),
+                out=out,
+                booted=float(found.get("autopilot_booted", 0.0)),
+                after=float(found.get("after_computer", math.nan)),
+                computer=str(found.get("computer_boot", "")),
+            )
         except FileNotFoundError:
             return Saved()
         except (
@@ -83,11 +92,14 @@ class FailoverFile:
             ) from error
 
     def _write(self, saved: Saved) -> None:
-        content = {
+        content: dict[str, object] = {
             "system_id": saved.system,
             "out_of_use": [imu + 1 for imu in saved.out],
             "autopilot_booted": round(saved.booted, 1),
         }
+        if saved.computer:
+            content["after_computer"] = round(saved.after, 1)
+            content["computer_boot"] = saved.computer
         try:
             with replacing(self._path) as file:
                 file.write(json.dumps(content).encode())

@@ -53,6 +53,7 @@ from fdi_ros.monitor.diagnostics import (
 from fdi_ros.monitor.output import INTEGRITY
 from fdi_ros.ros.node import REPORT_PERIOD, CheckedNode, message_class, read_diagnostics
 from fdi_ros.ros.process import Stop, guarded, make_executor
+from fdi_ros.system.clocks import read_clocks
 
 IMU = "sensor_msgs/msg/Imu"
 NAMES = (
@@ -185,7 +186,7 @@ class AutopilotNode(CheckedNode):
             )
         settings = PolicySettings(params["failover_limit"], params["failover_min_size"])
         channels = self.config.channel_names
-        return Failover(self._vehicle, channels, settings, path, time.time)
+        return Failover(self._vehicle, channels, settings, path, read_clocks)
 
     def live(self, stop: Stop) -> None:
         """Serve the link and the executor in turn, in one thread, until stopped."""

@@ -18,6 +18,7 @@ from fdi_ros.mavlink import failover_file
 from fdi_ros.mavlink.failover import Failover
 from fdi_ros.mavlink.failover_policy import Condition, PolicySettings
 from fdi_ros.mavlink.failover_words import WORDS
+from fdi_ros.system.clocks import Clocks
 from mavlink.autopilots import NS, PARAMETERS, UTC, Autopilot, Conversation
 from mavlink.flights import Flight
 
@@ -56,15 +57,15 @@ class Monitored(Conversation):
         super().__init__(*autopilots, may_set=True, **settings)
         policy = PolicySettings(limit, min_size)
         self.failover = Failover(
-            self.vehicle, CHANNELS, policy, path / "out.json", self.unix
+            self.vehicle, CHANNELS, policy, path / "out.json", self.clocks
         )
         self.states = [OK] * 9
         self.failover.is_alone = self.reports = True
         self.failover.age = 0.02
         self._fed = 0
 
-    def unix(self) -> float:
-        return UTC + self.now / NS
+    def clocks(self) -> Clocks:
+        return Clocks(UTC + self.now / NS)
 
     def run(self, seconds: float) -> "Monitored":
         for _ in range(round(seconds * 50)):
@@ -430,6 +431,54 @@ def test_a_boot_without_notch_filters_is_not_hidden(
     again.run(5.0)
     autopilot.reboot(again.now)
     assert again.run(12.0).failover.status(again.now)[1] == "ready"
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_power_cut_is_a_boot_though_unix_time_begins_again(
+    flying: Monitored, tmp_path: Path, together: bool
+) -> None:
+    """A computer without a time source begins each time with the same Unix time."""
+    autopilot = flying.autopilots[0]
+    flying.fault(1, 0.3, seconds=1.0)
+    flying.failover.close()
+    flying.heal(1)
+    autopilot.armed = False
+    autopilot.reboot(flying.now + NS)
+    again = Monitored(tmp_path, autopilot)
+    again.now = 1000 * NS + 60 * NS
+    autopilot.boot = autopilot.start = again.now - 5 * NS
+    unix = json.loads((tmp_path / "out.json").read_text())["autopilot_booted"]
+
+    def clocks() -> Clocks:
+        ago = (again.now - autopilot.boot) / NS
+        later = 20.0 if together else 300.0
+        moved = 0.0 if together else 100.0
+        return Clocks(unix + ago + moved, ago + later, "second")
+
+    again.failover._clocks = clocks
+    again.run(15.0)
+    assert not again.in_use[0], "no IMU without a notch filter by our hand"
+    assert "reboot before flight" in again.failover.status(again.now)[1]
+
+
+def test_a_new_start_of_the_node_needs_no_right_unix_time(
+    flying: Monitored, tmp_path: Path
+) -> None:
+    """The node is started again in flight, after Unix time was set by an hour."""
+    autopilot = flying.autopilots[0]
+    flying.failover._clocks = lambda: Clocks(
+        UTC + flying.now / NS, flying.now / NS, "a"
+    )
+    flying.fault(1, 0.3, seconds=1.0)
+    flying.failover.close()
+    boot, start = autopilot.boot, autopilot.start
+    again = Monitored(tmp_path, autopilot)
+    again.now, autopilot.boot, autopilot.start = flying.now, boot, start
+    again.failover._clocks = lambda: Clocks(
+        UTC - 3600.0 + again.now / NS, again.now / NS, "a"
+    )
+    again.heal(1, 12.0)
+    assert again.in_use == [True] * 3
 
 
 def test_an_operator_puts_back(flying: Monitored) -> None:

@@ -4,6 +4,7 @@
 """mavlink_node on real links, with simulated autopilots: Imu topics out, declarations back, nothing waits."""
 
 import contextlib
+import json
 import time
 from collections.abc import Callable, Iterator
 
@@ -17,6 +18,8 @@ from ros.harness import Listener, listening, stamps_of
 from ros.processes import ROOT, Process, assert_refused, running, wait
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
+
+from fdi_ros.system.clocks import read_clocks
 
 TOPICS = tuple(f"imu_{k}/data_raw" for k in (1, 2, 3))
 
@@ -151,10 +154,15 @@ def test_what_is_out_of_use_is_put_back_on_the_ground_if_the_monitor_reports_no_
 ) -> None:
     autopilot, file = Autopilot("ardupilot", armed=True), tmp_path / "out.json"
     autopilot.parameters["INS_USE2"] = 0.0
-    booted = time.time() + autopilot.boot / NS
-    file.write_text(
-        f'{{"system_id": 1, "out_of_use": [2], "autopilot_booted": {booted}}}'
-    )
+    clocks = read_clocks()
+    saved = {
+        "system_id": 1,
+        "out_of_use": [2],
+        "autopilot_booted": clocks.unix + autopilot.boot / NS,
+        "after_computer": clocks.uptime + autopilot.boot / NS,
+        "computer_boot": clocks.boot,
+    }
+    file.write_text(json.dumps(saved))
     failover = {"failover": "ardupilot", "failover_file": file}
     with linked_over_udp(autopilot, **failover) as (ears, _):
         assert ears.says("failover", "out of use: IMU 2 (imu_2) of system 1")
