@@ -29,9 +29,9 @@ LEAST_CHECKED = 0.5
 LEAST_DELIVERED = 0.9
 """Share of its messages that a healthy unit delivers."""
 LEAST_MISSING_S = 1.0
-"""Time without a fused rate that is reported, s; shorter outages are in the notes."""
+"""Time without a fused rate that is reported, s. Shorter outages are in the notes."""
 LEAST_SPIKES = 3
-"""Single wrong samples from which on a channel has spikes; fewer may be chance."""
+"""Single wrong samples from which on a channel has spikes. Fewer may be chance."""
 
 
 class Word(str, Enum):
@@ -54,7 +54,7 @@ class ChannelHealth:
     name: str
     """Name of the channel."""
     unit: str = ""
-    """Name of its unit; empty for a channel without a unit."""
+    """Name of its unit. Empty for a channel without a unit."""
     checked: float = 1.0
     """Share of the samples in which the other channels checked it."""
     delivered: float = 1.0
@@ -83,21 +83,19 @@ class UnitHealth:
     delivered: float = 1.0
     """Share of its messages that arrived, by its usual rate and that of the other units."""
     rate_hz: float | None = None
-    """Usual messages per second, Hz; None: not measured."""
+    """Usual messages per second, Hz. None: not measured."""
     slow_from_s: float | None = None
-    """Start of the longest time with fewer than half of its messages, s; None: no such time."""
+    """Start of the longest time with fewer than half of its messages, s. None: no such time."""
     slow_to_s: float | None = None
-    """End of that time, s; None: no such time, or it lasts to the end."""
+    """End of that time, s. None: no such time, or it lasts to the end."""
     slow_rate_hz: float | None = None
     """Messages per second during that time, Hz. Live: lately."""
     delay_s: float | None = None
-    """Delay of its stamps against the first unit, s; negative: early; None: not measured."""
+    """Delay of its stamps against the first unit, s. Negative: early. None: not measured."""
     delay_std_s: float | None = None
     """Standard deviation of the delay, s."""
     copy_of: str = ""
-    """Unit of which it repeats the values; empty: none."""
-    temperature_c: tuple[float, float] | None = None
-    """Lowest and highest temperature, degrees Celsius; None: not recorded."""
+    """Unit of which it repeats the values. Empty: none."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +105,7 @@ class RateHealth:
     missing_s: float = 0.0
     """Time without a fused rate, s."""
     missing_from_s: float | None = None
-    """Start of the first time without it, s; None: not known, or no such time."""
+    """Start of the first time without it, s. None: not known, or no such time."""
     share: float = 1.0
     """Share of the samples with a fused rate."""
 
@@ -158,7 +156,7 @@ def concerns_of(
     unused
         Topics of gyros that are left out, and why.
     rate
-        How the fused rate was published; None: not measured.
+        How the fused rate was published. None: not measured.
     """
     slow = [unit for unit in units if _is_slow(unit)]
     by_unit = {unit.name for unit in slow}

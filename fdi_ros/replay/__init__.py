@@ -15,7 +15,7 @@ class _Callable(ModuleType):
     """Package that can be called: ``fdi_ros.replay`` is a verb, too."""
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Replay a recording; arguments as of `fdi_ros.replay.run.replay`, whose docstring explains them."""
+        """Replay a recording. Arguments as of `fdi_ros.replay.run.replay`, whose docstring explains them."""
         from fdi_ros.replay.run import replay
 
         return replay(*arguments, **named)

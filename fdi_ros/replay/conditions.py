@@ -63,14 +63,14 @@ class Condition:
     name: str
     """Name of a quantity, or a state of channels."""
     sign: str = ""
-    """Comparison with the bound; empty for a quantity without a bound."""
+    """Comparison with the bound. Empty for a quantity without a bound."""
     bound: float = math.nan
     """Number on the right-hand side."""
     channels: tuple[str, ...] = ()
     """Channels whose state is asked for. Empty: the condition is about a quantity."""
 
     def reasons(self, judgement: Judgement) -> list[str]:
-        """Return one line for each reason why the condition fails; empty if it holds."""
+        """Return one line for each reason why the condition fails. Empty if it holds."""
         if self.channels:
             return [
                 f"{name}: {why}"
@@ -97,7 +97,7 @@ class Condition:
         return not self.sign or _COMPARISONS[self.sign](value, self.bound)
 
     def _of_fault(self, fault: Outcome) -> str:
-        """Return why an injected fault fails the condition; empty if it holds."""
+        """Return why an injected fault fails the condition. Empty if it holds."""
         name = f"{fault.kind} on {fault.channel}"
         if fault.delay_s is None:
             if fault.declared_before:
@@ -115,7 +115,7 @@ class Condition:
         return f"{name}: {'isolated' if isolation else 'detected'} after {delay:.3f} s"
 
     def _of_channel(self, channel: str, judgement: Judgement) -> str:
-        """Return what was declared of a channel if the condition fails; empty if it holds."""
+        """Return what was declared of a channel if the condition fails. Empty if it holds."""
         episodes = judgement.story.episodes
         by_state = {one.state: one for one in episodes if channel in one.channels}
         if self.name == "ambiguous":
@@ -162,7 +162,7 @@ def _measure(name: str, judgement: Judgement) -> tuple[float, str]:
 
 
 def failures(required: Sequence[Condition], judgement: Judgement) -> list[str]:
-    """Return one line for each reason why a replay does not pass; empty if it passes.
+    """Return one line for each reason why a replay does not pass. Empty if it passes.
 
     A recording must be judged for at least half of its samples, and no channel may end
     unchecked, unless a condition sets another bound.
@@ -179,7 +179,7 @@ def failures(required: Sequence[Condition], judgement: Judgement) -> list[str]:
 
 
 def parse_check(text: str, faults: int, names: Sequence[str] = ()) -> list[Condition]:
-    """Read conditions separated by blanks or commas; all of them must hold.
+    """Read conditions separated by blanks or commas. All of them must hold.
 
     Parameters
     ----------

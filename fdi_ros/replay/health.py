@@ -20,7 +20,7 @@ from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.soundness import UnitHealth
 
 MOST_WINDOWS = 4096
-"""Windows in which messages are counted; for longer recordings their length doubles."""
+"""Windows in which messages are counted. For longer recordings their length doubles."""
 WINDOW = 1.0
 """Length of a window at first, s."""
 MESSAGES_IN_WINDOW = 20.0
@@ -46,11 +46,11 @@ class Delivery(NamedTuple):
     share: float
     """Share of the messages that arrived, by its usual rate and that of the other topics."""
     rate: float | None
-    """Usual messages per second, Hz; None: too few messages."""
+    """Usual messages per second, Hz. None: too few messages."""
     slow_from: float | None = None
-    """Start of the longest time at less than `SLOW` of its rate, s; None: no such time."""
+    """Start of the longest time at less than `SLOW` of its rate, s. None: no such time."""
     slow_to: float | None = None
-    """End of that time, s; None: it lasts to the end, or there is no such time."""
+    """End of that time, s. None: it lasts to the end, or there is no such time."""
     slow_rate: float | None = None
     """Messages per second in that time, Hz."""
 

@@ -413,7 +413,7 @@ class Evaluation:
             self._add_effect(1, effect[active.any(axis=1) & ~undetected])
 
     def _count_missing_rates(self, output: Output) -> None:
-        """Count the samples without a rate; those before the first rate belong to the start-up."""
+        """Count the samples without a rate. Those before the first rate belong to the start-up."""
         rows = np.flatnonzero(~output.valid)
         if not self._has_had_rate:
             if not output.valid.any():

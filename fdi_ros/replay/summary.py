@@ -33,13 +33,13 @@ class ChannelResult(ChannelHealth):
     state: str
     """Name of its state."""
     since_s: float | None
-    """Time at which it came into the state, s from the first message; None: from the start."""
+    """Time at which it came into the state, s from the first message. None: from the start."""
     reason: str
-    """Reason for the state; empty: none."""
+    """Reason for the state. Empty: none."""
     bias_followed: float
     """Drift of its bias against the other channels since the start, rad/s."""
     noise: float | None
-    """Its noise at the end, in ``noise.noise_std``; None: not measured."""
+    """Its noise at the end, in ``noise.noise_std``. None: not measured."""
     unchecked: float
     """Share of all samples in which no other channel checked it."""
 
@@ -51,7 +51,7 @@ class DelayResult:
     unit: str
     """Name of the unit."""
     late_s: float
-    """Delay, s; negative: early."""
+    """Delay, s. Negative: early."""
     std_s: float
     """Standard deviation of the delay, s."""
 
@@ -95,7 +95,7 @@ class MonitorResult:
     bias: BiasResult
     """The biases."""
     note: str
-    """Why checking is limited, in words; empty: it is not."""
+    """Why checking is limited, in words. Empty: it is not."""
     protection_level: ProtectionLevel
     """Bound on the error of the fused rate."""
     us_per_sample: float
@@ -113,7 +113,7 @@ class SampleRate:
     configured_hz: float
     """``sample_rate`` of the settings, Hz."""
     recorded_hz: float | None
-    """Usual rate of the recording, Hz; None: too few samples."""
+    """Usual rate of the recording, Hz. None: too few samples."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class StreamResult:
     sample_rate: SampleRate
     """Configured and recorded rate."""
     origin_ns: int | None
-    """Stamp of the first message, from which all times count, ns; None: no message."""
+    """Stamp of the first message, from which all times count, ns. None: no message."""
     messages: int
     """Number of messages that were used."""
     malformed: dict[str, int]
@@ -142,16 +142,16 @@ class ReplayVerdict(NamedTuple):
     """The verdict on a replay."""
 
     word: str
-    """HEALTHY, LOOK, CANNOT TELL or FAULTY; with injected faults FOUND, NOT ALL FOUND or
+    """HEALTHY, LOOK, CANNOT TELL or FAULTY. With injected faults FOUND, NOT ALL FOUND or
     FALSE ALARM."""
     sentence: str
-    """The verdict in full; without injected faults it begins with the word."""
+    """The verdict in full. Without injected faults it begins with the word."""
     channels: tuple[str, ...]
-    """Channels that the word is about; also units or topics if it is LOOK."""
+    """Channels that the word is about. Also units or topics if it is LOOK."""
 
     @property
     def severity(self) -> Severity:
-        """How urgent it is; an exit code follows from that."""
+        """How urgent it is. An exit code follows from that."""
         if self.word in ("HEALTHY", "FOUND"):
             return Severity.GOOD
         urgent = self.word in ("FAULTY", "FALSE ALARM")
@@ -177,7 +177,7 @@ class Judgement:
 
     @property
     def unchecked_channels(self) -> list[ChannelResult]:
-        """Channels unchecked at the end; those with an injected fault to the end are left out."""
+        """Channels unchecked at the end. Those with an injected fault to the end are left out."""
         lasting = [
             fault
             for fault in self.scores.faults
@@ -236,7 +236,7 @@ class Summary(Judgement):
         return [*super().concerns, *unused]
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return the changes of state as a table; needs pandas.
+        """Return the changes of state as a table. Needs pandas.
 
         Columns: ``channel``, ``before``, ``state``, ``reason``, ``group`` and ``error`` (rad/s),
         as in `StateChange`. The index has their times, as in

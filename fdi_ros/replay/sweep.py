@@ -389,7 +389,7 @@ class Subject:
     block: Block
     channels: tuple[
         str, ...
-    ] = ()  # names of all channels; those excluded are tried with no fault
+    ] = ()  # names of all channels. Those excluded are tried with no fault
     gyros: int = 0
     """Number of the channels that are gyros, the first ones."""
     felt: tuple[int, ...] = ()

@@ -248,11 +248,8 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
         f"noise, {unit.name}": lambda row: number(_noise(row[1], unit), ".2g"),
         f"noise, {FORCES.name}": lambda row: number(_noise(row[1], FORCES), ".2g"),
         "delay": lambda row: milliseconds(row[0].delay_s),
-        "temperature": lambda row: _temperature_words(row[0].temperature_c),
         "trouble": lambda row: _trouble_words(summary, row[0].name, row[1]),
     }
-    if all(one.temperature_c is None for one in units):
-        del columns["temperature"]
     if all(one.delay_s is None for one in units):
         del columns["delay"]
     if all(one.measured_in != FORCES.name for one in channels):
@@ -271,10 +268,6 @@ def _noise(channels: Sequence[ChannelResult], unit: Unit) -> float | None:
         and (one.measured_in == FORCES.name) == (unit == FORCES)
     ]
     return max(known, default=None)
-
-
-def _temperature_words(span: tuple[float, float] | None) -> str:
-    return "-" if span is None else f"{span[0]:.0f} to {span[1]:.0f} C"
 
 
 def _trouble_words(
