@@ -284,6 +284,8 @@ class Evidence:
         imus = []
         for k, vector in enumerate(nearest):
             agrees = any(self._agree(k, j, apart) for j in partners.get(k, []))
+            if k in out and self._is_contradicted(k, partners.get(k, []), apart):
+                agrees = False
             agreed = (self.imus[k].agreed or now) if agrees else None
             if agreed is None or now - agreed < HEALED:
                 before = [held * size for size in self._sizes[k]]
@@ -373,6 +375,19 @@ class Evidence:
         is_stuck = self.raw.is_stuck(unit) or self.raw.is_stuck(other)
         return is_sound and not is_stuck and max(apart[unit, other]) < self._min_size
 
+    def _is_contradicted(
+        self, unit: int, partners: Sequence[int], apart: Apart
+    ) -> bool:
+        """Return whether an IMU differs from a partner that the monitor does not name.
+
+        Two IMUs that fail alike agree with each other, but not with the third.
+        """
+        return any(
+            max(apart[unit, k]) >= self._min_size
+            and not self._axes(k, ChannelState.FAULTY)
+            for k in partners
+        )
+
     def _is_odd(self, unit: int, units: Sequence[int], apart: Apart) -> bool:
         """Return whether the two other IMUs agree, and nothing is against these two.
 
@@ -399,7 +414,9 @@ class Evidence:
         """Return the IMU that is bad without a name, its axes, and how long that must stand.
 
         Of three IMUs that is the one that is off while the two others agree: by `CLEAR`,
-        or by less if the monitor has a doubt too. Else the only IMU with a set. -1: none.
+        or by less if the monitor has a doubt too. Else the only IMU with a set, unless
+        one of two others is not trusted: two that fail alike put the third into a set.
+        -1: none.
         """
         for k in units:
             if not self._is_odd(k, units, apart):
@@ -416,7 +433,11 @@ class Evidence:
                 return k, axes, LASTING
         sets = {k: self._axes(k, ChannelState.AMBIGUOUS) for k in units}
         found = [(k, axes, LASTING) for k, axes in sets.items() if axes]
-        return found[0] if len(found) == 1 else NOBODY
+        if len(found) != 1:
+            return NOBODY
+        others = [k for k in units if k != found[0][0]]
+        trusted = all(self._refuted[k] is not None for k in others)
+        return found[0] if trusted or len(others) < 2 else NOBODY
 
     def _clear_axes(self, unit: int, units: Sequence[int], now: int) -> set[int]:
         """Return the axes on which an IMU is far off from both others, in one direction.

@@ -173,6 +173,33 @@ def test_an_imu_whose_samples_are_lost_is_not_stuck(lost: int) -> None:
         assert not raw.is_stuck(1)
 
 
+def test_two_dead_gyros_with_noise_do_not_outvote_the_third_by_its_set() -> None:
+    """The monitor takes the first one back and has a set in the sound one."""
+    watched = Watched()
+    quiet = np.random.default_rng(2)
+
+    def dead(rate: np.ndarray) -> np.ndarray:
+        return quiet.normal(0.0, 0.002, 3)
+
+    watched.gyros[0] = dead
+    watched.states[:3] = [FAULTY] * 3
+    assert watched.blamed(2.5) == {0}
+    watched.out = [0]
+    watched.gyros[1] = dead
+    watched.states = [OK] * 6 + [AMBIGUOUS] * 3
+    for _ in range(400):
+        imus = watched.step()
+        assert not imus[2].blamed
+        assert imus[0].agreed is None, "it differs from one that nobody has named"
+
+
+def test_a_set_within_one_of_three_is_blamed_while_the_others_are_trusted() -> None:
+    watched = Watched()
+    watched.gyros[2] = biased(0.1)
+    watched.states[6:] = [AMBIGUOUS] * 3
+    assert watched.blamed(1.0) == {2}
+
+
 # What is no steady error ------------------------------------------------------------------
 
 
