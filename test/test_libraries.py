@@ -105,7 +105,7 @@ def test_without_a_library_a_verb_says_what_brings_it(tmp_path):
     done = python(VERBS_WITHOUT, asked)
     assert done.stdout == "2\n" * len(asked), done.stderr
     lines = done.stderr.splitlines()
-    pip = "pip install (--user --break-system-packages )?mcap rosbags lz4 zstandard"
+    pip = re.escape(f"{system._pip()} mcap rosbags lz4 zstandard")
     for verb, line in zip(more, lines[: len(more)], strict=True):
         assert re.fullmatch(
             rf"fdi: fdi {verb} needs mcap, rosbags, lz4(,| and) zstandard.*: {pip}.*",
@@ -124,5 +124,6 @@ def test_without_what_reads_recordings_the_player_says_what_brings_it():
         + "from fdi_ros.ros.process import run; sys.exit(run('player_node', []))"
     )
     assert done.returncode == 2
-    words = "reading recordings needs mcap, rosbags, lz4 and zstandard: pip install mcap rosbags lz4 zstandard"
-    assert done.stderr == f"player_node: {words}\n"
+    words = "reading recordings needs mcap, rosbags, lz4 and zstandard"
+    pip = f"{system._pip()} mcap rosbags lz4 zstandard"
+    assert done.stderr == f"player_node: {words}: {pip}\n"

@@ -483,12 +483,16 @@ def _curves(tried: Sequence[Subject], plan: Plan) -> list[Section]:
     for family in [
         name for name, sizes in families.items() if sizes >= LEAST_SIZES and tried
     ]:
-        own = {
+        every = {
             one.name: [
                 line for line in lines_of(one, plan) if line.swept.family == family
             ]
             for one in tried
         }
+        # A recording without accelerometers has no trial of their faults.
+        own = {name: lines for name, lines in every.items() if lines}
+        if not own:
+            continue
         hint = "Solid: isolated; dashed: detected; dotted: 95 % interval of the share isolated (Wilson 1927)."
         axis = {"title": {"text": "share of the faults, %"}, "range": [-3, 103]}
         sections.append(

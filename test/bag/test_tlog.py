@@ -93,7 +93,7 @@ def test_what_has_no_two_imus_is_refused(tmp_path):
             slow,
             r"at 2 Hz; needed: two IMUs .* at 5 Hz or more, .* ArduPilot: SRn_RAW_SENS",
         ),
-        (raw, "this autopilot sent one IMU"),
+        (raw, "one IMU cannot be checked: this autopilot sent no other"),
         (struct.pack(">Q", UTC // 1000) + beat + raw, "has no SCALED_IMU"),
         (telemetry(Autopilot()), "has no SCALED_IMU"),
         (b"FMT, 128, 89", "is no log of a ground station"),
