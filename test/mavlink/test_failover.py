@@ -57,15 +57,14 @@ class Monitored(Conversation):
         super().__init__(*autopilots, may_set=True, **settings)
         policy = PolicySettings(limit, min_size)
         self.failover = Failover(
-            self.vehicle, CHANNELS, policy, path / "out.json", self.clocks
+            self.vehicle, CHANNELS, policy, path / "out.json", lambda: self.clocks()
         )
+        #: Clocks of the companion.
+        self.clocks = lambda: Clocks(UTC + self.now / NS)
         self.states = [OK] * 9
         self.failover.is_alone = self.reports = True
         self.failover.age = 0.02
         self._fed = 0
-
-    def clocks(self) -> Clocks:
-        return Clocks(UTC + self.now / NS)
 
     def run(self, seconds: float) -> "Monitored":
         for _ in range(round(seconds * 50)):
@@ -407,9 +406,7 @@ def test_a_gyro_that_is_still_faulty_stays_out_and_is_announced(
     assert flying.in_use == [True] * 3
 
 
-def test_a_boot_without_notch_filters_is_not_hidden(
-    flying: Monitored, tmp_path: Path
-) -> None:
+def started_anew(flying: Monitored, path: Path) -> Monitored:
     """The companion dies in flight, the autopilot is started anew with IMU 1 out of use."""
     autopilot = flying.autopilots[0]
     flying.fault(1, 0.3, seconds=1.0)
@@ -418,12 +415,18 @@ def test_a_boot_without_notch_filters_is_not_hidden(
     autopilot.armed = False
     autopilot.reboot(flying.now + NS)
     assert autopilot.notches == [False, True, True]
-    autopilot.boot = autopilot.start = 0
     autopilot.texts.clear()
-    again = Monitored(tmp_path, autopilot)
+    again = Monitored(path, autopilot)
     again.now = 1000 * NS + 60 * NS
-    autopilot.boot = again.now - 5 * NS
-    again.run(15.0)
+    autopilot.boot = autopilot.start = again.now - 5 * NS
+    return again
+
+
+def test_a_boot_without_notch_filters_is_not_hidden(
+    flying: Monitored, tmp_path: Path
+) -> None:
+    autopilot = flying.autopilots[0]
+    again = started_anew(flying, tmp_path).run(15.0)
     assert not again.in_use[0], "no IMU without a notch filter by our hand"
     assert "IMU 1 no notch: set INS_USE 1 and reboot" in again.texts
     assert "reboot before flight" in again.failover.status(again.now)[1]
@@ -439,14 +442,7 @@ def test_a_power_cut_is_a_boot_though_unix_time_begins_again(
 ) -> None:
     """A computer without a time source begins each time with the same Unix time."""
     autopilot = flying.autopilots[0]
-    flying.fault(1, 0.3, seconds=1.0)
-    flying.failover.close()
-    flying.heal(1)
-    autopilot.armed = False
-    autopilot.reboot(flying.now + NS)
-    again = Monitored(tmp_path, autopilot)
-    again.now = 1000 * NS + 60 * NS
-    autopilot.boot = autopilot.start = again.now - 5 * NS
+    again = started_anew(flying, tmp_path)
     unix = json.loads((tmp_path / "out.json").read_text())["autopilot_booted"]
 
     def clocks() -> Clocks:
@@ -455,7 +451,7 @@ def test_a_power_cut_is_a_boot_though_unix_time_begins_again(
         moved = 0.0 if together else 100.0
         return Clocks(unix + ago + moved, ago + later, "second")
 
-    again.failover._clocks = clocks
+    again.clocks = clocks
     again.run(15.0)
     assert not again.in_use[0], "no IMU without a notch filter by our hand"
     assert "reboot before flight" in again.failover.status(again.now)[1]
@@ -466,17 +462,13 @@ def test_a_new_start_of_the_node_needs_no_right_unix_time(
 ) -> None:
     """The node is started again in flight, after Unix time was set by an hour."""
     autopilot = flying.autopilots[0]
-    flying.failover._clocks = lambda: Clocks(
-        UTC + flying.now / NS, flying.now / NS, "a"
-    )
+    flying.clocks = lambda: Clocks(UTC + flying.now / NS, flying.now / NS, "a")
     flying.fault(1, 0.3, seconds=1.0)
     flying.failover.close()
     boot, start = autopilot.boot, autopilot.start
     again = Monitored(tmp_path, autopilot)
     again.now, autopilot.boot, autopilot.start = flying.now, boot, start
-    again.failover._clocks = lambda: Clocks(
-        UTC - 3600.0 + again.now / NS, again.now / NS, "a"
-    )
+    again.clocks = lambda: Clocks(UTC - 3600.0 + again.now / NS, again.now / NS, "a")
     again.heal(1, 12.0)
     assert again.in_use == [True] * 3
 
