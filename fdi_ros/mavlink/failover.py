@@ -123,7 +123,7 @@ class Failover:
         return self._vehicle.armed or not self._vehicle.in_reach or not waits
 
     def close(self) -> None:
-        """Wait until the file is written."""
+        """Wait until the file is written. Raise `ConfigError` if that fails."""
         self._file.close()
 
     def feed(self, sample: ImuSample) -> None:

@@ -38,6 +38,7 @@ class FailoverFile:
         self._path = path
         self.written = self._read(count)  #: Content on the disk.
         self._write(self.written)
+        self._wanted = self.written
         self._thread = ThreadPoolExecutor(max_workers=1)
         self._job: Future[None] | None = None
         self._retry = 0
@@ -45,6 +46,7 @@ class FailoverFile:
     def keep(self, saved: Saved, now: int) -> str:
         """Write new content in another thread. Return an error, or an empty text."""
         error = ""
+        self._wanted = saved
         if self._job is not None and self._job.done():
             cause = self._job.exception()
             self._job = None
@@ -57,8 +59,10 @@ class FailoverFile:
         return error
 
     def close(self) -> None:
-        """Wait for the last write."""
+        """Write the last content, if that has not been done. Raise `ConfigError` if it fails."""
         self._thread.shutdown()
+        if self._wanted[:2] != self.written[:2]:
+            self._write(self._wanted)
 
     def _read(self, count: int) -> Saved:
         try:

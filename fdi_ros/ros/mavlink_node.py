@@ -350,7 +350,10 @@ class AutopilotNode(CheckedNode):
         """Close the link too."""
         self._link.close()
         if self._failover is not None:
-            self._failover.close()
+            try:
+                self._failover.close()
+            except ConfigError as error:
+                self.get_logger().error(str(error))
         super().destroy_node()
 
 
