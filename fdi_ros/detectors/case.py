@@ -1,12 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The case that evidence opens: whether it stands against the noise of its own time.
+"""Open a case where the evidence stands against the noise of its own time, and name its channels.
 
-As a case is opened, the states go back to before the onset (`predict_from`), and the
-mean since then is to be explained (`fdi_ros.detectors.naming`) against all that is not
-known of the sensors. A case lasts until its evidence has gone, or its channels are left
-out.
+When a case opens, the error states return to their values before the onset
+(`predict_from`), and `fdi_ros.detectors.naming` explains the mean since the onset against
+every uncertainty of the sensors. A case ends when its evidence is gone, or when its
+channels are excluded.
 """
 
 from __future__ import annotations
@@ -54,74 +54,71 @@ from fdi_ros.estimator.snapshots import is_after_hole, move_biases, predict_from
 from fdi_ros.model.samples import Array
 
 STANDS = 0.6
-"""Share of the logarithm of the run length that a hypothesis has, against all that is
-not known, to open a case: less than the sums need, as what is not known is counted here
-in full."""
+"""Log odds that open a case, as a share of the logarithm of the run length. The sums need
+the whole logarithm, but here every uncertainty counts in full."""
 ENDS = 2.0  # log odds of the likeliest hypothesis below which a case ends: hardly better than none
-# channels are named again when the time since the onset has grown by this part: little
-# is new before
+# Channels are named again when the time since the onset has grown by one part in this.
 RENAME = 16
 SETTLED, SETTLED_AMONG_FEW = 0.2, 0.5
 SETTLED_TOGETHER = 2.0 * SETTLED_AMONG_FEW
-"""s that a name must stand, of one channel, where at most `FEW_CHECKS` check it, and of
-two: several faults look like one at first, and with so few checks three faults explain
-anything."""
+"""Time that a name must stand before it is declared, s: one channel, one channel with at
+most `FEW_CHECKS` checks, two channels. Several faults look like one at first, and with
+few checks three faults explain any mean."""
 FEW_CHECKS = 3
 CLEAR = 5000.0
-"""Log odds of a single fault from which it is named at once: a second error a twentieth
-as large would show by five standard deviations, (0.05^2) 2 CLEAR = 25."""
+"""Log odds from which a single fault is named at once. A second error a twentieth as large
+would then show by five standard deviations, (0.05^2) 2 CLEAR = 25."""
 OTHERS, TURNED = 6.0, 0.3
-"""What is left of other channels in a block, if only those named are faulty: within so
-many standard deviations, that noise does not reach in a flight, and so much of the
-others' error, as axes are learned while they are watched."""
+"""Largest rest of a healthy channel in a block, after the errors of the named channels: this
+many standard deviations, which noise does not reach in a flight, plus this share of the
+named error, because the axes are not exactly known."""
 ALIKE = 1e-3  # least share of the variance of a channel that others do not explain
 LARGEST_MOVE, WARMS = 0.04, 30.0
-"""All biases may move by so many rad/s within so many s (warming, rectified vibration):
-that is no fault."""
+"""All biases may move by this many rad/s within this many seconds without a fault: the
+sensors warm, or rectify vibration."""
 DRIFT_TIMES = 4
 LONGEST_DRIFT = WARMS * (1 << DRIFT_TIMES)
-"""A slow drift is looked for over so many s (480), as long as states are kept, and half
-as long, so many times."""
-# s after a gap from which the mean begins anew: as long as a name must stand
+"""Longest time over which a slow drift is searched, s: 480, the age of the oldest kept
+states. The search halves the time `DRIFT_TIMES` times."""
+# time after a gap before the mean starts anew, s: equal to the time that a name must stand
 LEAST_RETURN = 0.2
-# by so much at once at most: motors that start move biases by some 5 mrad/s, and no
-# more
+# largest move of all biases at once, rad/s: motors that start move them by some 0.005
 LARGEST_STEP = 0.015
 FASTEST = (
-    2.5  # and so many times as fast as that for a moment: warming is quickest at first
+    2.5  # peak rate of a move over the mean rate: warming is fastest at the beginning
 )
 
 
 @record
 class Case:
-    """An alarm that stands."""
+    """An alarm, with the channels under suspicion."""
 
     open: Flag
-    onset: Whole  # number of its first sample
+    onset: Whole  # first sample of the fault
     next: Whole  # sample at which channels are named again
-    candidate: Mask  # channels that could be named
-    since: Whole  # sample since which they could
-    isolated: Mask  # faulty for certain
-    suspects: Mask  # at least one of them is faulty
-    witnesses: Mask  # channels that those were found among
-    retry: Whole  # no case is opened before this sample
-    before: ErrorStates  # the states as they were when it was opened
-    moved: Real  # how far all biases have moved lately, rad/s
-    moved_at: Real  # when they last have, s since the start
-    moved_since: Whole  # number of the first sample that showed it
-    reference: Channels  # biases before, rad/s
+    candidate: Mask  # channels that the last mean names
+    since: Whole  # sample since which the last means name the same channels
+    isolated: Mask  # faulty channels, named for long enough
+    suspects: Mask  # a set with at least one faulty channel
+    witnesses: Mask  # channels present when the suspects were found
+    retry: Whole  # earliest sample at which a case may open again
+    before: ErrorStates  # states when the case opened
+    moved: Real  # recent move of all biases, rad/s
+    moved_at: Real  # time of the last move, s since the start
+    moved_since: Whole  # first sample that showed the last move
+    reference: Channels  # biases before the last move, rad/s
     inference: Inference
 
 
 @record
 class State:
-    """Memory of the method."""
+    """Memory of the method between samples."""
 
     begun: Flag
-    restored: Flag  # the states are those of a former run
-    cleared: Flag  # all suspicion is to be forgotten
-    declared: Mask  # channels that were declared until then
-    stamp: Whole  # of the last sample, ns
+    restored: Flag  # 1: the states come from an earlier run
+    cleared: Flag  # 1: the next sample drops all suspicion
+    declared: Mask  # channels declared up to that moment
+    stamp: Whole  # stamp of the last sample, ns
     estimator: Estimator
     scales: Scales
     case: Case
@@ -129,7 +126,7 @@ class State:
 
 @compiled
 def forget_evidence(params: Constants, state: State) -> None:
-    """Begin all sums anew, and end the case; the states and the noise stay."""
+    """Restart all sums and end the case. The states and the noise stay."""
     state.case.open = False
     state.case.isolated = state.case.suspects = state.estimator.excluded_from_rate = (
         state.estimator.under_test
@@ -139,7 +136,7 @@ def forget_evidence(params: Constants, state: State) -> None:
 
 @compiled
 def look_for_case(params: Constants, state: State) -> None:
-    """Look for a time scale whose evidence stands against the noise of that same time; open the case there."""
+    """Open a case on the time scale whose evidence best stands against the noise of the same time."""
     kf, case, best, found = state.estimator, state.case, math.log(params.limit), False
     for at in range(SCALES):
         scale, largest, channel, sign = state.scales[at], 0.0, -1, 1.0
@@ -166,10 +163,10 @@ def look_for_case(params: Constants, state: State) -> None:
 
 @compiled
 def look_for_drift(params: Constants, state: State) -> None:
-    """Open a case where the rate of change of a bias is none of those that biases have.
+    """Open a case where a bias changes faster than biases do.
 
-    What is learned of it has the variance that is lost: ``x^2 / (prior - P)`` is the
-    square of a normal value.
+    An estimate has the variance by which the prior variance has fallen, so
+    ``x^2 / (prior - P)`` is the square of a standard normal value.
     """
     kf, case, layout, worst = state.estimator, state.case, params.layout, 0.0
     if case.moved > 0.0 and kf.seconds - case.moved_at < LONGEST_DRIFT:
@@ -190,9 +187,9 @@ def look_for_drift(params: Constants, state: State) -> None:
 
 @compiled
 def look_for_change_in_hole(params: Constants, state: State) -> None:
-    """Open a case where a bias is another than before a hole in the stream, by more than it may have moved meanwhile.
+    """Open a case where a bias has changed over a hole in the stream by more than it may.
 
-    At first after a hole slow noise is unknown, and the states follow what the sums do not see.
+    Shortly after a hole slow noise is unknown, and the states absorb what the sums do not see.
     """
     kf, case, n, worst = state.estimator, state.case, params.sensors.n, 0.0
     information = kf.parity.information
@@ -222,7 +219,10 @@ def look_for_change_in_hole(params: Constants, state: State) -> None:
 
 @compiled
 def open_case(params: Constants, state: State) -> None:
-    """Go back to before the onset, and see whether a hypothesis stands against all that is not known of the sensors."""
+    """Return to the states before the onset, and keep the case only if a hypothesis stands.
+
+    A hypothesis stands where its log odds, with every uncertainty counted, pass `STANDS`.
+    """
     kf, case = state.estimator, state.case
     case.onset = max(case.onset, 1)
     case.open, case.candidate, case.isolated = True, 0, 0
@@ -244,11 +244,11 @@ def open_case(params: Constants, state: State) -> None:
 
 @compiled
 def shows_others(params: Constants, state: State, named: int) -> bool:
-    """Whether single blocks since the onset show errors of other channels than those named, at most three.
+    """Whether single blocks since the onset show errors of channels other than the named ones.
 
-    The mean of two that come and go, or that began one after the other, may look like a
-    third. That of a channel points its own way in every block, however large it is in
-    each.
+    At most three channels can be named. The mean of two faults that come and go, or that
+    begin one after the other, may look like a fault of a third channel. The error of one
+    channel has the same direction in every block, whatever its size there.
     """
     kf, inference, n = state.estimator, state.case.inference, params.sensors.n
     information, count = kf.block_information, 0
@@ -257,13 +257,13 @@ def shows_others(params: Constants, state: State, named: int) -> bool:
             if count == 3 or not information[i, i] > 0.0:
                 return False
             fill_correlations(information, i, named, inference.matrix[count])
-            # Channels that look alike have no matrix that can be inverted.
+            # The matrix of channels that look alike is singular.
             inference.matrix[count, count] += ALIKE
             count += 1
     invert(inference.matrix, count, inference.inverse)
     for j in range(n):
         if not named >> j & 1 and kf.judged >> j & 1 and information[j, j] > 0.0:
-            # Regression on those named.
+            # regression on the named channels
             fill_correlations(information, j, named, inference.along)
             variance = 1.0
             for p in range(count):
@@ -279,7 +279,10 @@ def shows_others(params: Constants, state: State, named: int) -> bool:
 def shows_other(
     params: Constants, state: State, named: int, j: int, variance: float
 ) -> bool:
-    """Whether channel j shows more in a block than those named explain, by the shares in ``amplitude``."""
+    """Whether channel j shows more in a block than the named channels explain.
+
+    ``amplitude`` holds the regression of channel j on each of the named channels.
+    """
     case, scale = state.case, state.scales[BLOCK]
     for back in range(scale.kept):
         first = scale.first[(scale.newest - back + KEPT) % KEPT]
@@ -299,7 +302,7 @@ def shows_other(
 
 @compiled
 def fill_correlations(information: Array, i: int, named: int, out: Array) -> None:
-    """Correlations of what is left over of channel i with that of those named, at most three."""
+    """Fill the correlations of the residual of channel i with those of the named channels."""
     q = 0
     for j in range(len(information)):
         if named >> j & 1:
@@ -310,7 +313,7 @@ def fill_correlations(information: Array, i: int, named: int, out: Array) -> Non
 
 @compiled
 def widen(params: Constants, state: State) -> None:
-    """Suspect more channels than those named, as blocks show others: those of their unit, if these explain all."""
+    """Suspect further channels where blocks show them: the rest of the unit, if that explains all."""
     inference = state.case.inference
     named = inference.common
     inference.common = 0
@@ -325,14 +328,14 @@ def widen(params: Constants, state: State) -> None:
 
 @compiled
 def name_channels(params: Constants, state: State) -> None:
-    """Name the channels that explain the mean since the onset, or of its last half if that is long ago."""
+    """Name the channels that explain the mean since the onset, or the last half of a long one."""
     kf, case, inference = state.estimator, state.case, state.case.inference
     size = kf.samples - case.onset + 1
     if size * params.period > LONG_TIME:
-        # A drift is largest at last.
+        # A drift is largest at the end.
         size = size // 2 + 1
     if (kf.samples - kf.returned) * params.period > LEAST_RETURN:
-        # Means over a gap are of another motion.
+        # A mean across a gap belongs to different motion.
         size = min(size, kf.samples - kf.returned + 1)
     explain_mean(params, kf, inference, size)
     if lacks_witnesses(case):
@@ -354,7 +357,7 @@ def name_channels(params: Constants, state: State) -> None:
 def explain_mean(
     params: Constants, kf: Estimator, inference: Inference, size: int
 ) -> None:
-    """Explain the mean of the last ``size`` samples, by a model that may be wrong by a share of the error found."""
+    """Explain the mean of the last ``size`` samples, with a model error in proportion to the fault."""
     set_mean(params, kf, inference, size)
     explain(params, inference)
     misfit = MISFIT * inference.largest
@@ -365,12 +368,12 @@ def explain_mean(
 
 @compiled
 def isolate(params: Constants, kf: Estimator, case: Case) -> None:
-    """Call channels faulty that all likely hypotheses have had in common for long enough."""
+    """Isolate the channels that all likely hypotheses have had in common for long enough."""
     inference = case.inference
     if inference.common != case.candidate:
         case.candidate, case.since = inference.common, kf.samples
     stood = (kf.samples - case.since) * params.period
-    # One value that is far off decides nothing, whatever the odds.
+    # A single outlying value decides nothing, whatever the odds.
     may_be_spike = 0 < kf.far_samples < params.least
     settled = stood >= time_to_settle(params, inference)
     if inference.common and settled and not may_be_spike:
@@ -381,7 +384,7 @@ def isolate(params: Constants, kf: Estimator, case: Case) -> None:
 
 @compiled
 def time_to_settle(params: Constants, inference: Inference) -> float:
-    """How long a name must stand, s."""
+    """Return the time that a name must stand before it is declared, s."""
     if inference.common & (inference.common - 1):
         return SETTLED_TOGETHER
     if inference.log_odds >= CLEAR:
@@ -393,16 +396,16 @@ def time_to_settle(params: Constants, inference: Inference) -> float:
 
 @compiled
 def lacks_witnesses(case: Case) -> bool:
-    """Whether channels are away that the suspects were found among, and that are none of them."""
+    """Whether channels are missing that were present when the suspects were found, suspects aside."""
     found = case.suspects | case.isolated
     return found != 0 and case.witnesses & ~case.inference.mask & ~found != 0
 
 
 @compiled
 def keep_suspects(case: Case) -> None:
-    """Keep what is known of the suspects, if the channels that are left do not clear them.
+    """Keep the suspects where the remaining channels do not clear them.
 
-    The others may not tell two units apart; who was wrong before is.
+    The remaining channels may be unable to distinguish two units, but earlier ones were able.
     """
     inference = case.inference
     if inference.union & case.suspects:
@@ -412,7 +415,10 @@ def keep_suspects(case: Case) -> None:
 
 @compiled
 def let_biases_move(params: Constants, state: State, std: float) -> bool:
-    """Go on with biases that have all moved by so much, rad/s, if that is not too far; return whether it is done."""
+    """Accept a move of all biases with this standard deviation, rad/s, unless it is too far.
+
+    Returns whether the move was accepted.
+    """
     kf, case, n = state.estimator, state.case, params.sensors.n
     lately = case.moved * math.exp(-(kf.seconds - case.moved_at) / WARMS) + std
     if lately > LARGEST_MOVE or std > LARGEST_STEP:
@@ -430,7 +436,7 @@ def let_biases_move(params: Constants, state: State, std: float) -> bool:
 
 @compiled
 def goes_too_far(params: Constants, state: State) -> bool:
-    """Whether a bias goes farther or faster since all have moved than they may: what passed for a move is a fault."""
+    """Whether a bias has gone farther or faster than a move of all biases may: a fault, not a move."""
     kf, case, feeds = state.estimator, state.case, params.layout.feeds
     if case.moved == 0.0 or kf.seconds - case.moved_at > WARMS:
         return False
@@ -449,7 +455,7 @@ def goes_too_far(params: Constants, state: State) -> bool:
 
 @compiled
 def undo_move(params: Constants, state: State) -> None:
-    """Open a case where all biases seemed to move; for `WARMS` no move is believed, as if they had moved too far."""
+    """Open a case at the onset of a supposed move of all biases, and accept no move for `WARMS`."""
     case = state.case
     case.onset, case.moved, case.moved_at = (
         case.moved_since,
@@ -461,7 +467,7 @@ def undo_move(params: Constants, state: State) -> None:
 
 @compiled
 def leave_aside(params: Constants, state: State) -> None:
-    """Leave channels under doubt out of the rate, as far as the others give one, and out of what is learned."""
+    """Keep doubtful channels out of the learned states, and out of the rate if the others give one."""
     kf, case = state.estimator, state.case
     kf.under_test = case.suspects | case.isolated
     kf.excluded_from_rate = 0
@@ -473,7 +479,7 @@ def leave_aside(params: Constants, state: State) -> None:
 
 @compiled
 def follow_case(params: Constants, state: State) -> None:
-    """Name the channels of an open case again when it has grown; end it when its evidence has gone."""
+    """Name the channels of an open case again when it has grown, and end it without evidence."""
     kf, case = state.estimator, state.case
     if kf.samples < case.next:
         return

@@ -1,12 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which channels explain a mean: the odds of every hypothesis, and the smallest set that holds the culprit.
+"""Find the channels that explain a mean: odds of every hypothesis, smallest set with the faulty channel.
 
-The mean y (n,) of the values over some time, less what is known of their errors, is
-``H w + D f + e`` with e normal of covariance M, f the errors and D (n, k) the directions of
-a hypothesis: a channel, a pair, a unit as a whole, its gain, its delay.
-docs/methods.md#naming has the mathematics, in the same symbols.
+The mean y (n,) of the values over some time, less their estimated errors, is
+``H w + D f + e``. Here e is normal with covariance M, f are the errors, and D (n, k) holds
+the directions of a hypothesis: a channel, a pair, a whole unit, its gain, its delay.
+docs/methods.md#naming has the mathematics in the same symbols.
 """
 
 from __future__ import annotations
@@ -48,34 +48,34 @@ from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import Array
 
 MOST = MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS
-"""Hypotheses at most: channels, pairs, three of each unit."""
+"""Largest number of hypotheses: channels, pairs, and three for each unit."""
 COINCIDENCE = 0.1
-"""Prior odds of all pairs of one channel together, and of each way in which any unit is
-wrong, against a channel. It is large for what it stands for: of three parallel gyros,
-two with the same fault look like the third with the opposite one, and only the odds of
-such a coincidence keep a healthy gyro from being named."""
+"""Prior odds, against one channel, of all pairs with that channel and of each way in which
+any unit is wrong. The value is deliberately large. With three parallel gyros, the same
+fault in two looks like the opposite fault in the third, and only the odds of such a
+coincidence protect the healthy third."""
 TWO_CHECKS = COINCIDENCE / 2
-"""Of the odds of pairs where there are two checks: two of five explain anything, and no
-fault would ever be named."""
+"""Factor on the odds of pairs where only two checks exist. A pair of five channels explains
+any mean, so with full odds no fault would ever be named."""
 GAIN_STD, DELAY_STD = 0.1, 0.01
-"""Of a unit that is wrong as a whole: gain, as by a wrong range, and delay in s, as of
-a clock that was set."""
+"""Standard deviations for a unit that is wrong as a whole: of its gain (a wrong range), and
+of its delay in s (a clock that was set)."""
 LEAST_PRESENCE = (
-    0.9  # share of the samples that a channel has delivered where its mean counts
+    0.9  # share of the samples that a channel must deliver before its mean counts
 )
-# logarithm that each amplitude costs, for sizes that may be anything over four decades
+# log odds that each free amplitude costs: its size may lie anywhere in four decades
 SPREAD = 1.3
-# share of the largest error by which the model may be wrong: axes and scale factors
+# possible error of the model (axes, scale factors) as a share of the largest error
 MISFIT = 0.004
 FIT, FIT_PER_CHECK = 6.0, 2.5
-"""Chi-square of what is left unexplained at most: so much, and so much for each degree
-of freedom. Noise alone exceeds it once in 240 at most."""
+"""Largest chi-square of the unexplained rest: a constant, and a part for each degree of
+freedom. Noise alone exceeds the limit at most once in 240 cases."""
 SET_MARGIN = 5.0
-"""A set holds all that are wrong with a probability of being incomplete of so many
-times what a name may be wrong by: that it holds none of them is far less likely."""
+"""A set may miss one of several faulty channels with this many times the risk of a wrong
+name. A set that misses all faulty channels is far less likely."""
 UNEXPLAINED_SHARE = 0.2
-"""All biases have moved where the best hypothesis of a fault leaves this share of the
-chi-square: a fault of one or two channels leaves hardly any, were it ever so large."""
+"""All biases have moved where the best hypothesis of a fault leaves at least this share of
+the chi-square. A fault of one or two channels leaves almost nothing, whatever its size."""
 NO_LOG = -1e300
 
 Odds = Annotated[NDArray[np.float64], "f8", (MOST,)]
@@ -87,19 +87,19 @@ Directions = Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]
 
 @record
 class Inference:
-    """A mean to be explained, the odds of all hypotheses on it, and the answer."""
+    """The mean to explain, the odds of all hypotheses, and the answer."""
 
-    mask: Mask  # channels that it is of
-    judged: Mask  # of these, those whose fault shows
-    before: Total  # sums of all samples before it
-    y: Channels  # values less what is known of their errors, rad/s
+    mask: Mask  # channels of the mean
+    judged: Mask  # channels of the mean whose faults show
+    before: Total  # sums of all samples before the mean
+    y: Channels  # values less their estimated errors, rad/s
     covariance: Square  # M, (rad/s)^2
     rate: Vector  # mean body rate, rad/s
     angular_acceleration: (
-        Channels  # angular acceleration along each channel, lately largest, rad/s^2
+        Channels  # recent peak of the angular acceleration along each channel, rad/s^2
     )
-    change: Vector  # of the body rate over that time, rad/s
-    at: Projection  # of the states in that motion
+    change: Vector  # change of the body rate over the mean, rad/s
+    at: Projection  # projection of the error states in the motion of the mean
     parity: Parity
     u: Channels  # A y, s/rad
     total: Real  # y' A y / 2
@@ -108,34 +108,33 @@ class Inference:
     inverse: Matrix
     along: Vector  # D' u
     amplitude: Vector  # estimated f, rad/s
-    fit: Real  # of the last hypothesis, in its best amplitude: what it explains of ``total``
-    count: Whole  # hypotheses
-    odds: Odds  # logarithms; then shares
-    fits: Odds
-    errors: Errors  # of each channel by each hypothesis, rad/s
+    fit: Real  # part of ``total`` that the last hypothesis explains with its best amplitude
+    count: Whole  # number of hypotheses
+    odds: Odds  # log odds, later shares
+    fits: Odds  # ``fit`` of each hypothesis
+    errors: Errors  # error of each channel by each hypothesis, rad/s
     members: Sets  # channels of each hypothesis
-    whole: Wholes  # by the hypothesis the gyros are healthy, their unit is not
+    whole: Wholes  # 1: the hypothesis calls the gyros healthy and their unit wrong
     # The answer:
-    log_odds: Real  # of the likeliest hypothesis against none
-    # channels that all likely hypotheses have in common, if the likeliest fits: they
-    # are faulty
+    log_odds: Real  # log odds of the likeliest hypothesis against no fault
+    # faulty channels: all likely hypotheses have them in common, and the likeliest fits
     common: Mask
-    union: Mask  # channels of which at least one is faulty
+    union: Mask  # a set with at least one faulty channel
     likeliest: Mask  # channels of the likeliest hypothesis
-    fit_of_best: Real  # what it explains of ``total``
-    fitted: Flag  # what it leaves is noise
-    error: Channels  # of each channel if it alone is faulty, rad/s
-    largest: Real  # of those of the likeliest hypothesis, rad/s
-    spread: Square  # mean square of the errors over all hypotheses, by their odds, (rad/s)^2
+    fit_of_best: Real  # part of ``total`` that the likeliest hypothesis explains
+    fitted: Flag  # 1: the likeliest hypothesis leaves only noise
+    error: Channels  # error of each channel if no other is faulty, rad/s
+    largest: Real  # largest error within the likeliest hypothesis, rad/s
+    spread: Square  # mean product of the errors over all hypotheses, by their odds, (rad/s)^2
 
 
 @compiled
 def set_mean_speed(
     layout: Layout, kf: Estimator, before: Total, share: float, signals: Array
 ) -> None:
-    """Put a share of the sums of absolute rates since ``before`` into signals (n, `SIGNALS`), rad/s.
+    """Put a share of the absolute rates summed since ``before`` into signals (n, `SIGNALS`), rad/s.
 
-    In a turn to and fro the mean rate is zero, and the mean of the absolute rate is not.
+    In a turn to and fro the mean rate is zero, but the mean absolute rate is not.
     """
     for k in range(SIGNALS):
         if layout.by[k] == SPEED:
@@ -145,10 +144,10 @@ def set_mean_speed(
 
 @compiled
 def set_mean(params: Constants, kf: Estimator, inference: Inference, size: int) -> None:
-    """Set the mean of the last ``size`` samples to be explained, and its covariance."""
+    """Set up the mean of the last ``size`` samples and its covariance."""
     n, layout, before = params.sensors.n, params.layout, inference.before
     total_before(kf, kf.samples - size + 1, before, n)
-    # The sums are kept at some moments only.
+    # Sums exist only for some earlier moments.
     size = kf.samples - before.sample
     fill_mean(params, kf, inference, size)
     signals = inference.at.signals
@@ -168,18 +167,18 @@ def set_mean(params: Constants, kf: Estimator, inference: Inference, size: int) 
 def fill_mean(
     params: Constants, kf: Estimator, inference: Inference, size: int
 ) -> None:
-    """Work out the mean of the values and of the motion since the sums before."""
+    """Compute the means of the values and of the motion since ``before``."""
     n, before = params.sensors.n, inference.before
     inference.mask = 0
     for i in range(n):
         count = kf.total.count[i] - before.count[i]
         if kf.mask >> i & 1 and count > LEAST_PRESENCE * size:
             inference.mask |= 1 << i
-            # What may still turn out to be a spike counts as long as it lasts.
+            # A value that may still prove to be a spike counts while it lasts.
             total = kf.total.values[i] + kf.spike_sum[i]
             inference.y[i] = (total - before.values[i]) / count
     inference.judged = inference.mask & kf.judged
-    # At rest a seeming rate is the fault itself, and no motion.
+    # At rest an apparent rate is the fault itself, not motion.
     moves = 1.0 if kf.noise.regime == MOTION else 0.0
     for a in range(3):
         inference.rate[a] = moves * (kf.total.rate[a] - before.rate[a]) / size
@@ -191,7 +190,7 @@ def fill_mean(
 
 @compiled
 def noise_of_mean(params: Constants, noise: Noise, i: int, size: int) -> float:
-    """Variance of the mean of ``size`` samples of channel i by noise, (rad/s)^2."""
+    """Return the noise variance of the mean of ``size`` samples of channel i, (rad/s)^2."""
     variance, slow = noise.now.sample[i], noise.longest[i]
     if size >= params.length:
         colour = max(1.0, noise.now.level[BLOCK, i] * slow)
@@ -206,8 +205,8 @@ def noise_of_mean(params: Constants, noise: Noise, i: int, size: int) -> float:
 def add_noise(
     params: Constants, kf: Estimator, inference: Inference, size: int
 ) -> None:
-    """Add to the covariance noise, and what motion makes of delays and of scale that is not linear."""
-    # A turn that ends as it began leaves no trace of a delay in the mean.
+    """Add noise to the covariance, and the errors that delays and nonlinear scale make in motion."""
+    # A delay leaves no trace in the mean of a turn that ends as it began.
     part = min(1.0, 3.0 * params.length / size)
     moves = 1.0 if kf.noise.regime == MOTION else 0.0
     for i in range(params.sensors.n):
@@ -224,7 +223,7 @@ def add_noise(
 
 @compiled
 def add_line(params: Constants, kf: Estimator, inference: Inference, size: int) -> None:
-    """Add vibration to the covariance: channels that show the same line are no independent witnesses."""
+    """Add vibration to the covariance: channels with the same line are not independent."""
     n, longest = params.sensors.n, kf.noise.longest
     for i in range(n):
         for j in range(n):
@@ -236,7 +235,7 @@ def add_line(params: Constants, kf: Estimator, inference: Inference, size: int) 
 
 @compiled
 def checks(mask: int, n: int) -> int:
-    """Return how many more channels a set has than the three that a rate takes."""
+    """Return how many channels a set has beyond the three that determine a rate."""
     count = -3
     for i in range(n):
         count += mask >> i & 1
@@ -245,7 +244,7 @@ def checks(mask: int, n: int) -> int:
 
 @compiled
 def reduce(inference: Inference, n: int, k: int) -> None:
-    """Work out D' u and D' A D for the first k directions."""
+    """Compute D' u and D' A D for the first k directions."""
     direction, information = inference.direction, inference.parity.information
     for p in range(k):
         inference.along[p] = dot(direction[p], inference.u, n)
@@ -260,10 +259,13 @@ def reduce(inference: Inference, n: int, k: int) -> None:
 
 @compiled
 def log_ratio(inference: Inference, n: int, k: int, given: float) -> float:
-    """Log likelihood ratio of errors along the first k directions; given: their variance, 0: as they are estimated."""
+    """Return the log likelihood ratio of errors along the first k directions.
+
+    ``given`` is the variance of the amplitudes; with 0 the estimate takes its place.
+    """
     reduce(inference, n, k)
     for p in range(k):
-        # Channels that look alike have no matrix that can be inverted.
+        # The matrix of channels that look alike is singular.
         inference.matrix[p, p] += ROUNDING * inference.matrix[p, p]
         if not inference.matrix[p, p] > 0.0:
             return NO_LOG
@@ -293,7 +295,7 @@ def log_ratio(inference: Inference, n: int, k: int, given: float) -> float:
 def add(
     inference: Inference, n: int, k: int, log_odds: float, members: int, whole: bool
 ) -> None:
-    """Add a hypothesis, that of k directions whose ratio was worked out last."""
+    """Add the hypothesis of k directions whose ratio was computed last."""
     for i in range(n):
         inference.errors[inference.count, i] = 0.0
         for p in range(k):
@@ -320,7 +322,7 @@ def set_direction(inference: Inference, n: int, k: int, channel: int) -> None:
 
 @compiled
 def add_channels(inference: Inference, n: int) -> None:
-    """Add each channel, and each pair of them where there are checks for it."""
+    """Add each channel, and each pair where enough checks exist."""
     free, information = checks(inference.mask, n), inference.parity.information
     for i in range(n):
         inference.error[i] = 0.0
@@ -339,7 +341,7 @@ def add_channels(inference: Inference, n: int) -> None:
         for j in range(i):
             if inference.judged >> i & 1 and inference.judged >> j & 1:
                 aii, ajj, aij = information[i, i], information[j, j], information[i, j]
-                # Of two that cannot be told apart one is enough.
+                # One of two indistinguishable channels is enough.
                 if aii * ajj - aij * aij > 1e-3 * aii * ajj:
                     set_direction(inference, n, 0, i)
                     set_direction(inference, n, 1, j)
@@ -355,7 +357,7 @@ def add_channels(inference: Inference, n: int) -> None:
 
 @compiled
 def add_units(params: Constants, inference: Inference) -> None:
-    """Add each unit as a whole: any errors of its channels, its gain, its delay."""
+    """Add each whole unit: any errors of its channels, its gain, its delay."""
     n, axes, rate = params.sensors.n, params.sensors.axes, inference.rate
     prior = math.log(COINCIDENCE / max(params.units, 1))
     for unit in range(params.units):
@@ -367,7 +369,7 @@ def add_units(params: Constants, inference: Inference) -> None:
                 count += 1
         if count < 2 or inside == inference.mask:
             continue
-        # Of a unit the others cannot check in all its axes, the rest is as good a hypothesis.
+        # The others check only some axes of the unit: the rest explains as much.
         add(
             inference,
             n,
@@ -391,7 +393,10 @@ def add_units(params: Constants, inference: Inference) -> None:
 
 @compiled
 def update_spread(inference: Inference, n: int, total: float) -> None:
-    """Mean square of the errors over all hypotheses, whose shares of ``total`` are in ``inference.odds``."""
+    """Update the mean products of the errors over all hypotheses.
+
+    ``inference.odds`` holds the share of each hypothesis, times ``total``.
+    """
     for i in range(n):
         for j in range(n):
             inference.spread[i, j] = 0.0
@@ -407,7 +412,7 @@ def update_spread(inference: Inference, n: int, total: float) -> None:
 
 @compiled
 def largest_of(inference: Inference) -> int:
-    """Return the number of the likeliest hypothesis of those not taken."""
+    """Return the index of the likeliest hypothesis not yet taken."""
     best = 0
     for k in range(inference.count):
         if inference.odds[k] > inference.odds[best]:
@@ -417,7 +422,7 @@ def largest_of(inference: Inference) -> int:
 
 @compiled
 def update_best(inference: Inference, n: int) -> None:
-    """Note the likeliest hypothesis, and whether what it leaves is noise."""
+    """Record the likeliest hypothesis, and whether it leaves only noise."""
     best = largest_of(inference)
     inference.log_odds, inference.likeliest = (
         inference.odds[best],
@@ -436,10 +441,10 @@ def update_best(inference: Inference, n: int) -> None:
 
 @compiled
 def choose(inference: Inference, n: int, confidence: float) -> None:
-    """Take the most likely hypotheses until their odds make up the confidence.
+    """Take the likeliest hypotheses until their odds add up to the confidence.
 
-    Where all of them contain a channel, it is faulty; but where some of them say that a
-    unit measures motion wrongly, its gyros may all be healthy.
+    A channel that all of these hypotheses contain is faulty. If one hypothesis is a unit
+    that measures motion wrongly, all gyros may be healthy and no channel is named.
     """
     update_best(inference, n)
     top, total = inference.log_odds, 0.0
@@ -453,15 +458,15 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
         if mass >= confidence * total:
             break
         best = largest_of(inference)
-        # A set of one channel would look like a name: it goes on to the next.
+        # A set of one channel would look like a name, so the next one joins.
         if mass < enough * total or union & (union - 1) == 0:
             union |= inference.members[best]
         mass += inference.odds[best]
         inference.odds[best] = 0.0
         common &= inference.members[best]
         some_whole = some_whole or inference.whole[best] != 0
-    # Of a unit that is off in all its channels each is suspect, and none is sure: some
-    # may be off by very little.
+    # A unit with errors in all its channels is a set, not names: the error of some
+    # channels may be very small.
     few = common & (common - 1) & ((common & (common - 1)) - 1) == 0
     named = inference.fitted and common > 0 and few and not some_whole
     inference.common = common if named else 0
@@ -470,7 +475,7 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
 
 @compiled
 def explain(params: Constants, inference: Inference) -> None:
-    """Explain a mean: find the smallest set of hypotheses that holds the truth with the confidence."""
+    """Find the smallest set of hypotheses that holds the truth with the wanted confidence."""
     n = params.sensors.n
     fill_joint_parity(
         inference.parity,
@@ -493,10 +498,10 @@ def explain(params: Constants, inference: Inference) -> None:
 
 @compiled
 def moved_by(inference: Inference, n: int) -> float:
-    """By how much all biases have moved, standard deviation, if that is what the mean shows; 0: it is not.
+    """Return the standard deviation by which all biases have moved, rad/s; 0: they have not.
 
-    So it is where no hypothesis of a few channels leaves noise, and the best of them
-    much of what is to be explained.
+    Biases have moved where no hypothesis of a few channels leaves only noise, and even
+    the best one leaves much of the mean unexplained.
     """
     residual = 2.0 * (inference.total - inference.fit_of_best)
     if inference.fitted or residual < UNEXPLAINED_SHARE * 2.0 * inference.total:

@@ -1,11 +1,12 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The detector that flies: the path of a sample through the estimator, the sums, and the case that they open.
+"""The flight detector: the path of a sample through the estimator, the sums, and the case that they open.
 
-The sums (`fdi_ros.detectors.sums`) are of innovations of the estimator
-(`fdi_ros.estimator.estimator`): white and of variance one, if what is known of the
-sensors holds. A case lasts until its evidence has gone, or its channels are left out.
+The estimator (`fdi_ros.estimator.estimator`) turns samples into innovations, which are
+white with variance one while the model of the sensors holds. The sums
+(`fdi_ros.detectors.sums`) accumulate evidence that they are not. A case
+(`fdi_ros.detectors.case`) ends when its evidence is gone, or its channels are excluded.
 """
 
 from __future__ import annotations
@@ -93,24 +94,23 @@ from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import FalseAlarmRate, NoiseModel
 from fdi_ros.model.samples import MAX_RATE
 
-# s that a fault lasts before it is declared: two samples at 100 Hz, as one value
-# decides nothing
+# shortest fault that is declared, s: two samples at 100 Hz, because one value decides nothing
 LEAST_TIME = 0.02
 PAUSE = 5.0
-"""s; after a longer hole in the stream the vehicle may be in another kind of motion:
-its slow noise is unknown anew."""
+"""Longest hole in the stream, s, that keeps the learned slow noise. After a longer one the
+vehicle may move differently."""
 LEAST_SCALE, LEAST_TIMING, LEAST_NONLINEARITY = 1e-3, 3e-4, 3e-4
-"""Scale error, sampling instant in s, and nonlinearity: less is not believed of any
-channel, calibrated or not."""
-FEWEST_BLOCKS = 3  # in a row from which the acceleration in the middle of one is known
+"""Smallest believable standard deviations of any channel, even a calibrated one: scale
+error, sampling instant in s, and nonlinearity."""
+FEWEST_BLOCKS = 3  # consecutive blocks from which the angular acceleration follows
 SHORT = (
     1.0 - 1e-9
-)  # what is shown of the threshold where the sums have reached it, and there is no alarm
+)  # statistic over threshold where the sums reach the threshold without an alarm
 
 
 @compiled
 def begin(params: Constants, state: State, sample: SampleInput) -> None:
-    """Begin with what is known beforehand."""
+    """Start the states and the noise from their priors."""
     kf, n = state.estimator, params.sensors.n
     state.begun = True
     if not state.restored:
@@ -123,7 +123,7 @@ def begin(params: Constants, state: State, sample: SampleInput) -> None:
 
 @compiled
 def pass_time(params: Constants, state: State, sample: SampleInput) -> float:
-    """Let the time since the last sample pass, s; after a hole all evidence begins anew."""
+    """Advance the time to this sample and return the step, s; restart all evidence after a hole."""
     kf = state.estimator
     if not state.begun:
         begin(params, state, sample)
@@ -144,7 +144,7 @@ def pass_time(params: Constants, state: State, sample: SampleInput) -> float:
 
 @compiled
 def update_mask(params: Constants, state: State, sample: SampleInput) -> None:
-    """Take over which channels are present. Once those named are out of use, a new search begins without them."""
+    """Adopt the set of present channels, and end the case once its channels are excluded."""
     kf, case = state.estimator, state.case
     blamed = case.isolated if case.isolated else case.suspects
     if case.open and blamed & ~sample.out == 0:
@@ -159,7 +159,7 @@ def update_mask(params: Constants, state: State, sample: SampleInput) -> None:
 
 @compiled
 def process_block(params: Constants, state: State, sample: SampleInput) -> None:
-    """Take a block that is complete: noise, states, evidence of the longer time scales."""
+    """Process a complete block: noise, states, and evidence on the longer time scales."""
     kf, case, n = state.estimator, state.case, params.sensors.n
     noise, learns = kf.noise, not case.open
     update_largest_rate(
@@ -195,11 +195,11 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     )
     kf.held = kf.held + kf.span if suspicious else 0.0
     if learns and not suspicious:
-        # Of a case that was refused.
+        # These channels belonged to a case that was refused.
         kf.under_test = 0
         update_line(params, kf)
     holds = kf.held > 0.0 and kf.held <= LONG_TIME and not case.open
-    # Without redundancy only rest shows errors.
+    # Without redundancy, errors show only at rest.
     if not holds and (kf.judged or kf.rest):
         learn(params, kf, weight)
     if learns and not suspicious and kf.seconds - kf.snapshot_at >= SNAPSHOT_TIME:
@@ -216,18 +216,18 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
 
 @compiled
 def take_delays_off(params: Constants, state: State) -> None:
-    """Take delays that are sure off the values from now on; looked at once a second."""
+    """Compensate well-known delays in the values to come; runs once a second."""
     kf = state.estimator
     if params.units > 1 and kf.seconds - kf.taken_off_at > 1.0:
         kf.taken_off_at = kf.seconds
         if transfer_delays(params, kf):
-            # Evidence so far is of other instants.
+            # The evidence so far belongs to other sampling instants.
             forget_evidence(params, state)
 
 
 @compiled
 def look_for_slow_faults(params: Constants, state: State) -> None:
-    """Look for faults that the states show and the sums do not."""
+    """Look for slow faults, which show in the states but not in the sums."""
     kf, case = state.estimator, state.case
     if kf.judged and not case.open and kf.samples >= case.retry:
         look_for_drift(params, state)
@@ -236,10 +236,10 @@ def look_for_slow_faults(params: Constants, state: State) -> None:
 
 @compiled
 def forget_suspicion(params: Constants, state: State) -> None:
-    """Begin the search anew.
+    """Drop all suspicion and restart the search.
 
-    Clocks that were set are no fault that lasts: of a unit that was declared as a whole
-    the delay is re-estimated.
+    A clock that was set is not a lasting fault, so the delay of a unit that was declared
+    as a whole is estimated again.
     """
     kf, case = state.estimator, state.case
     inflate_delays(
@@ -253,17 +253,17 @@ def forget_suspicion(params: Constants, state: State) -> None:
 
 @compiled
 def is_blind(kf: Estimator) -> bool:
-    """Whether it is not known how far off the states make a sample: since a hole the motion is another."""
+    """Whether the errors of a sample in motion are unknown, as shortly after a hole."""
     return kf.unseen and kf.noise.regime == MOTION
 
 
 @compiled
 def process_sample(params: Constants, state: State, sample: SampleInput) -> None:
-    """Take a sample into estimator and evidence."""
+    """Process one sample: correction, noise, outliers, and evidence on the short time scales."""
     kf = state.estimator
     for i in range(params.sensors.n):
         sample.z[i] = min(max(sample.z[i], -MAX_RATE), MAX_RATE)
-    # Without a sample for so long a block begins anew.
+    # After such a pause a new block begins.
     if kf.seconds - kf.used_at > max(1.5 * BLOCK_TIME, 2.5 * params.period):
         drop_block(kf, params.sensors.n)
     kf.used_at = kf.seconds
@@ -273,7 +273,7 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
     correct_sample(params, kf, sample.z, kf.fused.gain)
     watch_for_motion(params, kf)
     if kf.blocks < FEWEST_BLOCKS and kf.noise.regime == MOTION:
-        # No block says yet how the body moves, but the sample does.
+        # No block gives the motion yet, but the sample does.
         project(params.layout, kf.states, kf.at)
         update_weights(params, kf)
     follow_displacement(params, kf, sample.displaced)
@@ -289,11 +289,10 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
 def fill_verdict(
     params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
-    """Put into the verdict what was found, and into the sample what is known of the errors of the sensors."""
+    """Fill the verdict, and the estimated sensor errors of the sample."""
     kf, case, n = state.estimator, state.case, params.sensors.n
     unsure = case.open and case.isolated == 0
-    # What the channels disagree by now beyond all that is known, as in a shock that
-    # they measure at other instants.
+    # The channels may disagree beyond the model, as in a shock at unequal sampling instants.
     odd = 1.0 if case.open else kf.odd
     fill_scores(params, state.estimator, state.scales, verdict.scores)
     for i in range(n):
@@ -307,12 +306,12 @@ def fill_verdict(
         sample.estimate.spikes[i] = kf.spikes[i]
         sample.estimate.bias_std[i] = math.sqrt(kf.states.p[i, i])
         for j in range(n):
-            # While it is open which channels are faulty, each may be off by what it is
-            # if it is one of them.
+            # Until the faulty channels are named, each one may have the error that the
+            # hypotheses give it.
             doubt = case.inference.spread[i, j] if unsure else 0.0
             sample.estimate.covariance[i, j] = kf.at.covariance[i, j] + doubt
         if unsure and kf.mask >> i & 1:
-            # And where no hypothesis says why it is off, by what it differs from the others now.
+            # Where no hypothesis explains a deviation, the deviation itself counts.
             innovation = kf.innovation[i]
             if innovation * innovation > THREE_SIGMA * (
                 sample.estimate.covariance[i, i] + variance
@@ -331,7 +330,7 @@ def fill_verdict(
                 verdict.suspects[i], verdict.error[i] = True, case.inference.error[i]
         verdict.statistic = max(verdict.statistic, verdict.threshold)
     else:
-        # Evidence that does not stand against the noise of the same time is none.
+        # Evidence that fails against the noise of the same time is no alarm.
         verdict.statistic = min(verdict.statistic, SHORT * verdict.threshold)
 
 
@@ -339,7 +338,7 @@ def fill_verdict(
 def judge(
     params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
-    """Take one sample into estimator and sums; where their mean reaches the limit, test what it is, and name."""
+    """Judge one sample: update estimator and sums, follow the case or open one, fill the verdict."""
     kf = state.estimator
     verdict.threshold = math.log(1.0 + params.limit)
     seconds = pass_time(params, state, sample)
@@ -367,7 +366,7 @@ def judge(
     process_sample(params, state, sample)
     if add_sample(params, kf, sample.z, seconds):
         process_block(params, state, sample)
-        # Its covariance is that of now.
+        # The block has changed the covariance of this sample.
         has_spike = kf.spiked != 0 and kf.spiked != kf.mask
         gain = kf.clean.gain if has_spike else kf.fused.gain
         correct_sample(params, kf, sample.z, gain)
@@ -376,13 +375,13 @@ def judge(
         follow_evidence(params, state, verdict)
     fill_verdict(params, state, sample, verdict)
     if kf.judged == 0:
-        # The rate and its covariance go on; nothing checks the channels.
+        # Rate and covariance continue, but the channels are unchecked.
         verdict.statistic = verdict.threshold = math.nan
 
 
 @compiled
 def follow_evidence(params: Constants, state: State, verdict: SampleVerdict) -> None:
-    """Follow the case that is open, or look for one where the mean of the sums reaches the limit."""
+    """Follow the open case, or look for one where the mean of the sums reaches the limit."""
     kf, case = state.estimator, state.case
     mean = mean_of(params, kf, state.scales)
     verdict.statistic = math.log(1.0 + mean)
@@ -400,45 +399,45 @@ def follow_evidence(params: Constants, state: State, verdict: SampleVerdict) -> 
 
 
 class Sequential(Detector):
-    r"""Shiryaev-Roberts sums of the innovations of an error-state estimator; channels named by the odds since onset.
+    r"""Shiryaev-Roberts sums of the innovations of an error-state estimator, with names by posterior odds.
 
-    The estimator knows bias, scale error, misalignment and delay of the channels, each
-    with its uncertainty, and the noise of the moment. Sums over channels, signs, sizes
-    and time scales of a fault tell where its innovations are not white: where their
-    mean reaches `run_length`, a hypothesis that explains the values since the onset has
-    to stand against everything that is not known of the sensors. While the alarm
-    stands, the smallest set of hypotheses that holds the truth with `confidence` is
-    named; `isolated` if all of it have a channel in common and the best of it leaves no
-    more than noise. `Verdict.statistic` is the logarithm of one plus the mean of all
-    sums: below the threshold without an alarm, never below it with one, and 0 while
-    evidence is void. docs/methods.md has the rest.
+    The estimator tracks bias, scale error, misalignment and delay of the channels, each
+    with its uncertainty, and the present noise. Sums over channels, signs, sizes and time
+    scales of a fault grow where the innovations are not white. Where the mean of the sums
+    reaches `run_length`, a hypothesis that explains the values since the onset must stand
+    against every uncertainty of the sensors. While the alarm lasts, the detector names the
+    smallest set of hypotheses that holds the truth with probability `confidence`. The
+    fault is `isolated` if these hypotheses have a channel in common and the best one
+    leaves only noise. `Verdict.statistic` is the logarithm of one plus the mean of all
+    sums: below the threshold without an alarm, at or above the threshold with one, and 0
+    while no evidence counts. docs/methods.md has the details.
 
     Parameters
     ----------
     geometry
         Sensitivity axes.
     noise
-        Error model of a healthy channel: `scale_std` and `bias_std` are what the
-        estimator begins with.
+        Error model of a healthy channel. The estimator starts from `scale_std` and
+        `bias_std`.
     run_length
-        Mean samples to a false alarm of the whole detector, 2 to 1e15; default 3.6e8
-        (1e-3 an hour at 100 Hz).
+        Mean number of samples to a false alarm of the whole detector, 2 to 1e15; default
+        3.6e8 (1e-3 per hour at 100 Hz).
     false_alarms_per_hour
-        The other way to give it, with `sample_rate`.
+        Alternative to `run_length`, with `sample_rate`.
     sample_rate
-        Hz; it sets the lengths of the blocks. Default 100.
+        Sample rate, Hz; sets the length of the blocks. Default 100.
     confidence
-        With which the truth is in the set named, above 0.5 and below 1.
+        Probability that the named set holds the truth, above 0.5 and below 1.
     bias_walk
         Random walk of the bias of each channel, scalar or (n,), rad/s/sqrt(s).
     delay_std
-        How late the stamps of one unit may be against another's, standard deviation, s.
+        Standard deviation of the delay of one unit against another, s.
     gain_odds
-        Prior odds of a wrong gain of a unit, against those of gyros. Gravity lets the gain of
-        an accelerometer always show, as an error of the vertical one.
+        Prior odds of a wrong gain of a unit, relative to gyros. Gravity makes a wrong gain
+        of an accelerometer always visible, as an error of the vertical channel.
     louder
-        Noise variance of a channel over its largest before, from which its slow noise is
-        learned anew.
+        Ratio of the noise variance of a channel to its largest so far, from which its
+        slow noise is learned again.
     """
 
     name = "sequential"
@@ -530,6 +529,6 @@ class Sequential(Detector):
         params["limit"], params["confidence"] = self.run_length, confidence
 
     def clear(self, declared: int = 0) -> None:
-        """Forget all suspicion; what is known of the sensors stays, but for the delay of a unit declared as a whole."""
+        """Drop all suspicion; keep the sensor errors, except the delay of a unit declared as a whole."""
         self.states["cleared"] = True
         self.states["declared"] |= declared

@@ -1,12 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Values too far off to be used in their sample, and spikes: outliers that last a few samples.
+"""Outliers, which are too far off for their sample, and spikes, which are outliers of a few samples.
 
-The first hypothesis that leaves no more than noise is taken: one channel, then one unit. Where parity cannot tell two
-hypotheses apart, as with two parallel units, the one that changes the rate least since the sample before is taken, if
-it does so by far; else all of them are left out. A spike is counted, and kept out of the estimator's rate, of its
-blocks and of what it learns of vibration. The evidence of faults takes the values as they are.
+The first hypothesis that leaves only noise explains an outlier: one channel, then one unit.
+Parity cannot distinguish some hypotheses, as with two parallel units. Then the one that
+changes the rate least since the last sample is taken, if by far; otherwise all their
+channels are excluded. A spike is counted and kept out of the estimated rate, the blocks and
+the learned vibration. The evidence for faults uses all values unchanged.
 """
 
 from __future__ import annotations
@@ -26,19 +27,21 @@ from fdi_ros.estimator.noise import BURST, FAR, THREE_SIGMA
 from fdi_ros.model.samples import Array
 
 OUTLIER = 5.5  # standard deviations, reached by normal noise in one of 2e7 values
-ALIKE = 0.95  # share of the largest distance from which a channel may be the culprit as well
+ALIKE = 0.95  # share of the largest distance from which a channel is also a candidate
 SPIKE_SAMPLES = (
     4  # longest spike: re-stamping spreads a single value over its neighbours
 )
 MISFIT = 1e-4
-"""Share of the chi-square that a true hypothesis may leave: 1 % of the spike in other channels, whose scale errors were
-corrected at a rate that holds it."""
-CLOSER = 0.25  # ratio of squared changes of the rate from which the smaller one decides
+"""Share of the chi-square that a true hypothesis may leave: 1 % of the spike shows in other
+channels, because their scale errors were corrected at a rate that contains the spike."""
+CLOSER = (
+    0.25  # ratio of squared changes of the rate below which the smaller one decides
+)
 
 
 @compiled
 def find_outliers(params: Constants, kf: Estimator, values: Array) -> None:
-    """Find the outliers of a sample, and correct the sample without those that may be a spike."""
+    """Find the outliers of a sample, and correct the sample without possible spikes."""
     kf.outliers = kf.spiked = 0
     burst, farthest = 1.0, 0.0
     for i in range(params.sensors.n):
@@ -54,7 +57,7 @@ def find_outliers(params: Constants, kf: Estimator, values: Array) -> None:
         if kf.distance[i] > ALIKE * farthest:
             candidates |= 1 << i
     if kf.far_samples >= SPIKE_SAMPLES:
-        # This lasts: it is left to the evidence which channels are wrong.
+        # A lasting deviation is no spike: the evidence decides which channels are wrong.
         growth = motion_growth(kf, kf.rate)
         if largest_of(params, kf, growth) > OUTLIER:
             kf.outliers = candidates
@@ -69,7 +72,7 @@ def find_outliers(params: Constants, kf: Estimator, values: Array) -> None:
 def explain_outliers(
     params: Constants, kf: Estimator, values: Array, candidates: int, burst: float
 ) -> None:
-    """Find which channels explain a sample that is far off, and whether they are a spike."""
+    """Find the channels that explain an outlying sample, and whether they may be a spike."""
     fill_sample_covariance(params, kf)
     limit = MISFIT * chi_without(params, kf, 0)
     chosen = choose(params, kf, candidates, burst, limit)
@@ -77,7 +80,7 @@ def explain_outliers(
         chosen = remove_farthest(params, kf, burst)
     if params.determines[kf.mask & ~chosen]:
         chi_without(params, kf, chosen)
-    # A rate that holds a spike would excuse it as an error of scale.
+    # A rate that contains the spike would excuse the spike as a scale error.
     largest = largest_of(params, kf, motion_growth(kf, kf.clean_rate))
     if largest > OUTLIER:
         kf.outliers = chosen
@@ -90,14 +93,17 @@ def explain_outliers(
 
 @compiled
 def excess_of(kf: Estimator, i: int) -> float:
-    """Variance of the noise of a channel now over the learned one."""
+    """Return the present noise variance of a channel over the learned one."""
     level = kf.shared.level[i] / kf.noise.now.sample[i]
     return max(1.0, BURST * kf.noise.quick[i], level)
 
 
 @compiled
 def largest_of(params: Constants, kf: Estimator, growth: float) -> float:
-    """Largest distance of a channel in standard deviations, as what is not known of the states has grown."""
+    """Return the largest distance of a channel, standard deviations.
+
+    ``growth`` is the present variance of the state uncertainty over the one in the sample.
+    """
     largest = 0.0
     for i in range(params.sensors.n):
         variance = kf.share[i] + growth * (1.0 - kf.share[i])
@@ -108,7 +114,7 @@ def largest_of(params: Constants, kf: Estimator, growth: float) -> float:
 
 @compiled
 def fill_sample_covariance(params: Constants, kf: Estimator) -> None:
-    """Fill M of a sample, as the sample is judged with it."""
+    """Fill the covariance M by which a sample is judged."""
     for i in range(params.sensors.n):
         for j in range(params.sensors.n):
             kf.matrix[i, j] = 2.0 * params.length * kf.at.covariance[i, j]
@@ -117,7 +123,7 @@ def fill_sample_covariance(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def chi_without(params: Constants, kf: Estimator, without: int) -> float:
-    """Chi-square of the sample without some channels; the rate of the others is in ``kf.clean_rate``."""
+    """Return the chi-square of the sample without some channels; ``kf.clean_rate`` gets the rate of the others."""
     n, parity = params.sensors.n, kf.clean
     mask = kf.mask & ~without
     fill_joint_parity(parity, params.sensors, mask, kf.matrix, UNKNOWN_RATE)
@@ -137,10 +143,10 @@ def chi_without(params: Constants, kf: Estimator, without: int) -> float:
 def change_without(
     params: Constants, kf: Estimator, without: int, burst: float, limit: float
 ) -> float:
-    """Square of the change of the rate since the last sample if some channels are wrong, (rad/s)^2.
+    """Return the squared change of the rate since the last sample if some channels are wrong, (rad/s)^2.
 
-    Negative: the others disagree, or give no rate. ``burst``: variance over
-    the learned one; ``limit``: chi-square allowed beyond noise.
+    The result is negative if the other channels disagree or give no rate. ``burst`` is the
+    variance over the learned one, ``limit`` the chi-square allowed beyond noise.
     """
     if not params.determines[kf.mask & ~without]:
         return -1.0
@@ -152,7 +158,7 @@ def change_without(
     change = 0.0
     for a in range(3):
         step = kf.clean_rate[a] - kf.total.instant[a]
-        # Noise of either rate is no change.
+        # The noise of the two rates is not a change.
         change += max(step * step, THREE_SIGMA * kf.clean.inverse[a, a])
     return change
 
@@ -163,8 +169,9 @@ def choose(
 ) -> int:
     """Return the channel, or the channels of the unit, that explains the sample; 0: none does.
 
-    A channel is preferred. A unit is taken where it changes the rate less by far: some spikes of a unit look like one
-    of a channel of another. Where two do as well, all channels of both are returned.
+    A channel is preferred. A unit is chosen where the unit changes the rate far less,
+    because some spikes of a unit look like a spike of one channel of another unit. Where
+    two explanations are equally good, the channels of both are returned.
     """
     channel = 0
     of_channel = next_channel = math.inf
@@ -191,13 +198,13 @@ def choose(
 
 @compiled
 def decides(kf: Estimator, least: float, second: float) -> bool:
-    """Whether the least change of the rate is the smaller one by far; after a hole no rate is known."""
+    """Whether the least change of the rate is smaller by far; after a hole no rate is known."""
     return second == math.inf or (kf.blocks > 0 and least < CLOSER * second)
 
 
 @compiled
 def remove_farthest(params: Constants, kf: Estimator, burst: float) -> int:
-    """Return channels of several units: the farthest again and again, until the rest is noise."""
+    """Return channels of several units: remove the farthest until the rest is noise."""
     without = 0
     for _ in range(params.sensors.n):
         chi, free = chi_without(params, kf, without), -3.0
@@ -221,7 +228,7 @@ def remove_farthest(params: Constants, kf: Estimator, burst: float) -> int:
 def leave_spike_out(
     params: Constants, kf: Estimator, values: Array, burst: float
 ) -> None:
-    """Correct a sample by the rate of the channels that are no outliers, and impute the others from it."""
+    """Correct a sample by the rate of the channels without outliers, and impute the outliers."""
     kf.spiked = kf.outliers
     if not params.determines[kf.mask & ~kf.spiked]:
         kf.spiked = kf.mask
@@ -235,7 +242,7 @@ def leave_spike_out(
         kf.imputed[i] = kf.corrected[i]
         if kf.spiked >> i & 1:
             kf.imputed[i] -= kf.innovation[i]
-            # Of a unit that is left out some channels may be well.
+            # Some channels of an excluded unit may be correct.
             if kf.innovation[i] ** 2 > OUTLIER * OUTLIER * kf.growth[i]:
                 kf.spike_channels |= 1 << i
             kf.innovation[i] = 0.0
@@ -245,7 +252,7 @@ def leave_spike_out(
 def end_spike(params: Constants, kf: Estimator) -> None:
     """Count a spike that has just ended, for its channels if they are known.
 
-    What ends because its channel is left out, or is under test, is a fault.
+    A deviation that ends because its channel is excluded or under test is a fault.
     """
     channels = kf.spike_channels & kf.mask & ~kf.under_test
     if 0 < kf.far_samples <= SPIKE_SAMPLES:
