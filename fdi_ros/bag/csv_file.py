@@ -127,7 +127,9 @@ class CsvLog(FlightLog):
     def portions(self) -> Iterator[Portion]:
         """Read the table from its start up to `end`."""
         delimiter, columns = find_columns(self.file, self.note, self.first)
-        offset, bad, rest = self.file.tell(), 0, b""
+        offset = self.file.tell()
+        bad = 0
+        rest = b""
         while rest or offset < self.end:
             data = rest + self.file.read(
                 max(0, min(_PORTION, self.end - offset - len(rest)))
@@ -168,7 +170,8 @@ class CsvLog(FlightLog):
                     columns = columns._replace(tick=tick)
                 samples = _samples(table[good], ends[used][good], columns, self.first)
             self.counts["lines"] += len(used)
-            offset, rest = offset + size, b"" if final else data[size:]
+            offset = offset + size
+            rest = b"" if final else data[size:]
             yield samples, offset / self.end
             if final:
                 break
@@ -452,7 +455,8 @@ def _samples(
     stamp = np.round(np.clip(table[:, 0] * columns.tick * 1e6, -1.0, 9e18)).astype(
         np.int64
     )
-    found, behind = [], 3 * len(columns.imus)
+    found = []
+    behind = 3 * len(columns.imus)
     for k, factor in enumerate(columns.factors):
         at = 1 + 3 * k
         rate = table[:, at : at + 3] * factor

@@ -201,7 +201,8 @@ def find_records(
             continue
         if data[position + 2] == _FMT and sizes[data[position + 3]] == 0:
             sizes[data[position + 3]] = data[position + 4]
-        found[0, count], found[1, count] = data[position + 2], position
+        found[0, count] = data[position + 2]
+        found[1, count] = position
         count += 1
         position = end
     return count, position, lost
@@ -282,7 +283,8 @@ class DataflashLog(FlightLog):
             starts.keys() & self._layouts.keys(),
             key=lambda k: self._names[k] not in _UNITS,
         ):
-            name, layout = self._names[k], self._layouts[k]
+            name = self._names[k]
+            layout = self._layouts[k]
             rows = np.lib.stride_tricks.sliding_window_view(data, layout.itemsize)[
                 starts[k]
             ].view(layout)[:, 0]

@@ -93,8 +93,10 @@ def imu_samples(
 ) -> ImuSamples:
     """Return samples (k,) from stamps and ends (k,), rates and accelerations (k, 3)."""
     samples = np.empty(len(stamp), _SAMPLE)
-    samples["stamp"], samples["end"] = stamp, end
-    samples["rate"], samples["acceleration"] = rate, acceleration
+    samples["stamp"] = stamp
+    samples["end"] = end
+    samples["rate"] = rate
+    samples["acceleration"] = acceleration
     return samples
 
 
@@ -294,9 +296,11 @@ class FlightLog(BagFile):
             )
             samples = _joined([one for _, one in found])
             stamp = (samples["stamp"] + self._shift) * 1000
-            order, horizon = np.argsort(stamp, kind="stable"), self._log_time(later)
+            order = np.argsort(stamp, kind="stable")
+            horizon = self._log_time(later)
             for k in range(0, len(order), _TOGETHER):
-                rows, rest = order[k : k + _TOGETHER], order[k + _TOGETHER :]
+                rows = order[k : k + _TOGETHER]
+                rest = order[k + _TOGETHER :]
                 data = _encoded(templates[place[rows]], stamp[rows], samples.take(rows))
                 count, size = data.shape
                 yield Batch(
@@ -512,7 +516,8 @@ def _encoded(data: Bytes, stamp: Int, samples: ImuSamples) -> Bytes:
     }
     fields = data.view(np.dtype(layout))[:, 0]
     fields["sec"], fields["nanosec"] = np.divmod(stamp, 1_000_000_000)
-    fields["rate"], absent = samples["rate"], np.isnan(samples["acceleration"])
+    fields["rate"] = samples["rate"]
+    absent = np.isnan(samples["acceleration"])
     fields["acceleration"] = np.where(absent, 0.0, samples["acceleration"])
     # Zero covariance means unknown, -1 as the first element absent (REP-145).
     fields["absent"] = -1.0 * absent.any(axis=1)
@@ -542,7 +547,8 @@ def _copies_of(
             sensors[source].count for source in pair
         ):
             same.update(pair)
-    ordered, half = sorted(same), len(same) // 2
+    ordered = sorted(same)
+    half = len(same) // 2
     return (
         {} if len(same) % 2 else dict(zip(ordered[half:], ordered[:half], strict=True))
     )

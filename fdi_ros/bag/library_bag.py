@@ -38,7 +38,8 @@ class LibraryBag(BagFile):
             for number, one in self._numbered.items()
             if one.name in topics
         }
-        whole, read = sum(self._numbered[number].count for number in chosen), 0
+        whole = sum(self._numbered[number].count for number in chosen)
+        read = 0
         found = self._messages(list(chosen)) if chosen else iter(())
         while messages := list(_together(found)):
             read += len(messages)

@@ -136,7 +136,8 @@ def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
     """
     count = position = descriptions = 0
     while position + _PREFIX <= len(data):
-        opcode, length = data[position], read_bits(data, position + 1, 8, True)
+        opcode = data[position]
+        length = read_bits(data, position + 1, 8, True)
         start = position + _PREFIX
         # A length beyond all integers comes out negative.
         if not 0 <= length <= len(data) - start:
@@ -149,11 +150,9 @@ def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
         wanted = described and descriptions <= DESCRIPTIONS
         if wanted or (opcode == MESSAGE and length >= head):
             if count < found.shape[1]:
-                found[0, count], found[3, count], found[4, count] = (
-                    opcode,
-                    start + head,
-                    length - head,
-                )
+                found[0, count] = opcode
+                found[3, count] = start + head
+                found[4, count] = length - head
                 if head:
                     found[1, count] = read_bits(data, start, 2, True)
                     found[2, count] = read_bits(data, start + 6, 8, True)
@@ -229,7 +228,10 @@ class McapFile(BagFile):
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
-        read, whole, held, known = 0, sum(piece.size for piece in self._pieces), 0, -1
+        read = 0
+        whole = sum(piece.size for piece in self._pieces)
+        held = 0
+        known = -1
         waiting: list[Batch] = []
         following = [*(piece.start_time for piece in self._pieces[1:]), NO_HORIZON]
         for k, (piece, horizon) in enumerate(
@@ -240,10 +242,13 @@ class McapFile(BagFile):
             held += len(waiting[-1].buffer)
             if held < _TOGETHER and k < len(self._pieces):
                 continue
-            found, waiting, held = Batch.joined(waiting), [], 0
+            found = Batch.joined(waiting)
+            waiting = []
+            held = 0
             if len(self._channels) != known:
                 # Reading may describe further channels.
-                known, number = len(self._channels), np.full(1 << 16, -1)
+                known = len(self._channels)
+                number = np.full(1 << 16, -1)
                 for channel in self._channels.values():
                     number[channel.id] = (
                         topics.index(channel.topic) if channel.topic in topics else -1
@@ -297,7 +302,8 @@ class McapFile(BagFile):
             self.note("it unpacks to more bytes than it should: read up to there")
 
     def _scan(self) -> None:
-        position, left = len(self.magic), RECORDS + self.size // RECORD_BYTES
+        position = len(self.magic)
+        left = RECORDS + self.size // RECORD_BYTES
         while position < self.size:
             head = self._read(position, _RECORD.size)
             opcode, length = (

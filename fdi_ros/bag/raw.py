@@ -170,7 +170,9 @@ class BagFile(ABC):
     system: int | None = None
 
     def __init__(self, path: Path, damage: Damage, most: int) -> None:
-        self.path, self._damage, self._left = path, damage, most
+        self.path = path
+        self._damage = damage
+        self._left = most
         try:
             self.file = open_regular(path)
         except OSError as error:

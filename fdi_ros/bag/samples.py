@@ -76,7 +76,8 @@ class Samples:
         brought = [self.source.brought(k, n, m) for k in range(len(self.topics))]
         self._brought = np.array([one.size for one in brought])
         """Number of values that a message of each topic brings."""
-        self._gyros, self._forces = n, m
+        self._gyros = n
+        self._forces = m
         self._values = max(self._brought)
         columns = [
             ("topic", "i8"),
@@ -236,7 +237,8 @@ class Samples:
         found = newest > before
         force[found] = values[newest[found], : self._forces]
         if len(gyros) and not found[0] and self._waiting is not None:
-            force[0], found[0] = self._waiting, True
+            force[0] = self._waiting
+            found[0] = True
         last = gyros[-1] if len(gyros) else -1
         if last < len(values) - 1:
             self._waiting = values[-1, : self._forces].copy()
@@ -259,7 +261,8 @@ class Samples:
                 if all_ready
                 else int(np.searchsorted(held["log_time"], batch.horizon))
             )
-            messages, held = held[:ready], held[ready:]
+            messages = held[:ready]
+            held = held[ready:]
             self.progress = batch.progress
             if (
                 len(messages)
@@ -278,8 +281,10 @@ class Samples:
     def _decoded(self, batch: Batch) -> Rows:
         """Decode a batch; malformed messages and those outside the span are left out."""
         messages = np.empty(len(batch), self._row)
-        messages["topic"], messages["log_time"] = batch.topic, batch.log_time
-        messages["stamp"], messages["values"] = batch.log_time, np.nan
+        messages["topic"] = batch.topic
+        messages["log_time"] = batch.log_time
+        messages["stamp"] = batch.log_time
+        messages["values"] = np.nan
         keep = np.zeros(len(batch), dtype=bool)
         for count in np.unique(self._brought).tolist():
             rows = np.flatnonzero(self._brought[batch.topic] == count)
@@ -313,10 +318,8 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
     steps = np.sort(np.diff(stamp)) * 1e-9
     if len(steps) < _FEWEST_STEPS or steps[0] <= 0:
         return
-    usual, mean = (
-        1.0 / np.median(steps),
-        1.0 / steps[: -max(1, len(steps) // 100)].mean(),
-    )
+    usual = 1.0 / np.median(steps)
+    mean = 1.0 / steps[: -max(1, len(steps) // 100)].mean()
     off = np.array([usual, mean]) / configured
     if (off > 1.0 + RATE_TOLERANCE).all() or (off < 1.0 - RATE_TOLERANCE).all():
         raise BagError(

@@ -107,10 +107,8 @@ class SqliteFile(LibraryBag):
     def _copied(self, log: Path) -> Path:
         """Copy the file and its write-ahead log to a temporary folder for SQLite."""
         folder = self._open.enter_context(scratch_folder("fdi_bag"))
-        room, size = (
-            shutil.disk_usage(folder).free // 2,
-            self.path.stat().st_size + log.stat().st_size,
-        )
+        room = shutil.disk_usage(folder).free // 2
+        size = self.path.stat().st_size + log.stat().st_size
         if size > room:
             raise BagError(
                 f"{self.path} has a write-ahead log and must be copied to be read: {size >> 20} MB, expected at most"

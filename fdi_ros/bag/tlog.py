@@ -99,10 +99,8 @@ class Tlog(LibraryLog):
         ):
             if message.get_srcSystem() != system:
                 continue
-            came, number = (
-                int.from_bytes(data[at : at + _TIME], "big"),
-                message.get_msgId(),
-            )
+            came = int.from_bytes(data[at : at + _TIME], "big")
+            number = message.get_msgId()
             if number not in MESSAGES:
                 self._take_words(number, message, came, texts)
                 continue
@@ -185,7 +183,8 @@ class Tlog(LibraryLog):
             if end > len(data):
                 break
             if not end:
-                at, lost = at + 1, lost + 1
+                at = at + 1
+                lost = lost + 1
                 continue
             start = at + _TIME
             second = data[start] == 0xFD

@@ -191,7 +191,8 @@ class Ulog(LibraryLog):
                     stamp, rate = _unpacked(stamp, columns)
                 elif kind == _STATUS:
                     # The mean of 0.1 s belongs to the middle of that time.
-                    stamp, rate = stamp - _MEAN_TIME // 2, _array(columns, "mean_gyro")
+                    stamp = stamp - _MEAN_TIME // 2
+                    rate = _array(columns, "mean_gyro")
                 elif kind == _SELECTED:
                     rate = _array(columns, "gyro_rad")
                 else:

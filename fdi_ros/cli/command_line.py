@@ -680,7 +680,8 @@ def _overview() -> str:
     wide = max(map(len, VERBS)) + 2
 
     def line(name: str) -> str:
-        first, others = f"  {name:<{wide}}", " " * (wide + 2)
+        first = f"  {name:<{wide}}"
+        others = " " * (wide + 2)
         return textwrap.fill(
             VERBS[name].meaning, width, initial_indent=first, subsequent_indent=others
         )

@@ -72,12 +72,10 @@ def progress(
         return
     from tqdm import tqdm
 
-    shown, begun, compiled, ended = (
-        _TIMED_FORMAT if timed else _FORMAT,
-        clock(),
-        compiling_seconds(),
-        threading.Event(),
-    )
+    shown = _TIMED_FORMAT if timed else _FORMAT
+    begun = clock()
+    compiled = compiling_seconds()
+    ended = threading.Event()
     # disable=None: tqdm shows a bar only in a terminal.
     bar = tqdm(
         total=1.0, desc=what, file=stream, disable=None, bar_format=shown, leave=False
@@ -92,7 +90,8 @@ def progress(
             if not bar.disable:
                 bar.refresh()
                 continue
-            spent, share = clock() - begun, done
+            spent = clock() - begun
+            share = done
             words = f"{spent:.0f} s so far"
             if share > 0:
                 left = spent * (1 / share - 1)
@@ -103,7 +102,8 @@ def progress(
 
     def show(share: float) -> None:
         nonlocal compiled, done
-        before, compiled = compiled, compiling_seconds()
+        before = compiled
+        compiled = compiling_seconds()
         if not bar.disable:
             # The time left must not include the time of compiling.
             bar.start_t += compiled - before

@@ -37,10 +37,8 @@ if TYPE_CHECKING:
 
 def run_inspect(arguments: Namespace) -> int:
     """Print the fitness of a recording and its topics and write a config to start from."""
-    outputs, unit = (
-        Outputs(arguments, ("json", "output"), [arguments.bag]),
-        unit_of(arguments.degrees),
-    )
+    outputs = Outputs(arguments, ("json", "output"), [arguments.bag])
+    unit = unit_of(arguments.degrees)
     reports, damage = inspect(arguments.bag)
     config, refused = _starting_config(reports, arguments.bag)
     found = verdict_of(recording_findings(reports, refused, unit))
@@ -142,10 +140,8 @@ def _calibrated(
     arguments: Namespace, found: SetupResult
 ) -> tuple[dict[str, object], str]:
     """Return the settings that a calibration changes, and the comment on their origin."""
-    bag, configs = (
-        shown(arguments.bag.name),
-        ", ".join(shown(file.name) for file in arguments.config),
-    )
+    bag = shown(arguments.bag.name)
+    configs = ", ".join(shown(file.name) for file in arguments.config)
     if found.kept:
         return (
             {},
@@ -182,10 +178,8 @@ def _finish(
         Pipeline(Config.from_file(path))
 
     said = str(arguments.bag), str(arguments.output), unit_of(arguments.degrees)
-    text, figures = (
-        setup_text(found, *said) + more,
-        setup_figures(found, str(arguments.bag)),
-    )
+    text = setup_text(found, *said) + more
+    figures = setup_figures(found, str(arguments.bag))
     severity = verdict_of(setup_findings(found)).severity
     return outputs.finish(
         text, figures, lambda: setup_page(found, *said), severity, output=write

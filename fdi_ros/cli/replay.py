@@ -234,10 +234,8 @@ def run_sweep(arguments: Namespace) -> int:
     subjects = _subjects(arguments, configs)
     with progress(sys.stderr, arguments.quiet, "faults") as show:
         results = sweep(subjects, plan, arguments.workers, show)
-    text, figures = (
-        sweep_text(results, plan, arguments.bag.name),
-        sweep_figures(results, plan, str(arguments.bag)),
-    )
+    text = sweep_text(results, plan, arguments.bag.name)
+    figures = sweep_figures(results, plan, str(arguments.bag))
     tried = {
         "compared with": ", ".join(arguments.compare) or "nothing",
         "faults": "; ".join(

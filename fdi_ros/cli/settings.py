@@ -239,7 +239,8 @@ def warm_verbs() -> None:
         from fdi_ros.bag.mcap_file import walk
 
         walk(b"")
-        sizes, found = np.zeros(256, dtype=np.int64), np.empty((2, 1), dtype=np.int64)
+        sizes = np.zeros(256, dtype=np.int64)
+        found = np.empty((2, 1), dtype=np.int64)
         find_records(np.frombuffer(b"\0", dtype=np.uint8), sizes, True, found)
     rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
     fill_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))

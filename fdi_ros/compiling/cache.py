@@ -238,7 +238,8 @@ class Kept(_Files):
 
     def _close(self) -> None:
         """Check that no other user can write the folder of the function, or one between it and that of all results."""
-        inside, top = Path(self._cache_path), folder()
+        inside = Path(self._cache_path)
+        top = folder()
         above = [one for one in inside.parents if one.is_relative_to(top)]
         for one in (inside, *above):
             close_to_others(one)

@@ -174,7 +174,8 @@ def _call_as_part(dispatcher: Any) -> None:
         Kept.new_marks.add(dispatcher._cache.mark())
         return found
 
-    dispatcher.get_call_template, dispatcher.get_overload = find, part.get_overload
+    dispatcher.get_call_template = find
+    dispatcher.get_overload = part.get_overload
 
 
 class Callback:
@@ -183,7 +184,8 @@ class Callback:
     def __init__(
         self, function: Callable[..., None], records: tuple[type, ...]
     ) -> None:
-        self.function, self.records = function, records
+        self.function = function
+        self.records = records
         self.compiled: Any = None  # once the address was asked for
         _callbacks.append(self)
 
@@ -231,7 +233,8 @@ def address_of(rows: NDArray[Any]) -> int:
 @contextlib.contextmanager
 def reported(what: str) -> Iterator[None]:
     """Log one line with the duration if anything is compiled within, and not just loaded."""
-    begun, before = time.perf_counter(), compilations()
+    begun = time.perf_counter()
+    before = compilations()
     yield
     if compilations() > before:
         LOG.warning(

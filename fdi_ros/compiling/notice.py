@@ -124,7 +124,8 @@ def progress_logged(
     The time left assumes that the rest of the functions takes as long as those that are done.
     """
     LOG.warning(WORDS)
-    begun, over = time.monotonic(), threading.Event()
+    begun = time.monotonic()
+    over = threading.Event()
 
     def report() -> None:
         wait = FIRST_REPORT

@@ -299,7 +299,8 @@ def _check_consistency(config: Config) -> None:
 
 
 def _check_accelerometers(config: Config) -> None:
-    own, topic = config.accelerometers, config.channels.acceleration_topic
+    own = config.accelerometers
+    topic = config.channels.acceleration_topic
     if own.enabled == "on" and not (config.has_units or topic):
         raise ConfigError(
             f"accelerometers.enabled is 'on', but input is {config.input!r} without channels.acceleration_topic"
@@ -483,7 +484,8 @@ def parameter_file(
     lines = textwrap.indent(_yaml(ros), " " * 4).splitlines() if ros else []
     section = ""
     for name in filter(parameters.__contains__, PARAMETERS):
-        before, section = section, name.rpartition(".")[0]
+        before = section
+        section = name.rpartition(".")[0]
         if section != before:
             lines += ["", f"    {section}:"]
         lines += _entry(
@@ -542,7 +544,8 @@ def _update(tree: dict[Any, Any], new: Mapping[Any, Any]) -> None:
 
 def _entry(name: str, value: Any, remark: str, indent: int) -> Iterator[str]:
     """Return the lines of one parameter. A comment too long for the line goes above."""
-    declared, margin = PARAMETERS[name], " " * indent
+    declared = PARAMETERS[name]
+    margin = " " * indent
     meaning = (
         f"{declared.unit}: {declared.description}"
         if declared.unit

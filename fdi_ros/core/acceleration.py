@@ -44,10 +44,8 @@ def differentiate_rate(
 @compiled
 def note_known(acceleration: Acceleration, oldest: int) -> None:
     """Move the oldest sample to a number, and store its rate if it has one."""
-    acceleration.oldest, one = (
-        oldest,
-        acceleration.history[oldest % ACCELERATION_SAMPLES],
-    )
+    acceleration.oldest = oldest
+    one = acceleration.history[oldest % ACCELERATION_SAMPLES]
     if math.isfinite(one.rate[0]):
         acceleration.has_known = 1
         acceleration.known.stamp = one.stamp

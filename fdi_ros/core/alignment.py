@@ -92,7 +92,8 @@ def enter(aligner: Aligner, j: int, stamp: int) -> None:
         return
     unit.counters.received += 1
     if not aligner.begun:
-        aligner.begun, aligner.common = True, stamp
+        aligner.begun = True
+        aligner.common = stamp
     goes_on = 0 < stamp - unit.before <= aligner.timeout and not _is_silent(
         aligner, unit
     )
@@ -104,17 +105,22 @@ def enter(aligner: Aligner, j: int, stamp: int) -> None:
             goes_on and unit.end > 0 and lag > aligner.timeout and not unit.leapt
         )
         if _have_all_moved(aligner, j, stamp):
-            aligner.phase, aligner.force, aligner.moved_to = _RESTARTING, _ALL, stamp
+            aligner.phase = _RESTARTING
+            aligner.force = _ALL
+            aligner.moved_to = stamp
         return
     for i in range(aligner.n):
         aligner.units[i].off = False
-    unit.lag, unit.parted, unit.leapt = max(lag, 0), False, False
+    unit.lag = max(lag, 0)
+    unit.parted = False
+    unit.leapt = False
     _accept(aligner, unit, stamp, aligner.rate, aligner.felt)
     if aligner.formed and stamp <= aligner.last:
         unit.counters.late += 1
         unit.begin = unit.end
         return
-    aligner.phase, aligner.force = _FORMING, _NONE
+    aligner.phase = _FORMING
+    aligner.force = _NONE
     if unit.end - unit.begin > MAX_PENDING:
         aligner.force = unit.messages[(unit.begin + 1) % RING].stamp
 
@@ -133,7 +139,8 @@ def is_live(aligner: Aligner, j: int) -> bool:
 @compiled
 def are_parted(aligner: Aligner) -> bool:
     """Return whether the clocks of the only two units that deliver differ by more than the timeout."""
-    believed, parted = 0, False
+    believed = 0
+    parted = False
     for j in range(aligner.n):
         believed += aligner.units[j].end > 0 and is_live(aligner, j)
         parted = parted or aligner.units[j].parted
@@ -161,7 +168,8 @@ def _pass_time(aligner: Aligner, j: int, stamp: int) -> None:
         for k in range(aligner.n):
             if k != j:
                 aligner.units[k].passed[j] += step
-    unit.heard, unit.before = True, stamp
+    unit.heard = True
+    unit.before = stamp
     _find_common_time(aligner)
 
 
@@ -171,7 +179,9 @@ def _find_common_time(aligner: Aligner) -> None:
 
     While at most two units deliver, the common time is the newest stamp.
     """
-    deliver, newest, second = 0, _NONE, _NONE
+    deliver = 0
+    newest = _NONE
+    second = _NONE
     for j in range(aligner.n):
         unit = aligner.units[j]
         if unit.end > 0 and not _is_silent(aligner, unit):
@@ -211,13 +221,16 @@ def _accept(
     """Add a message to the waiting messages of its unit."""
     step = stamp - unit.newest if unit.end > 0 else _UNKNOWN
     message = unit.messages[unit.end % RING]
-    message.stamp, message.step = stamp, step
+    message.stamp = stamp
+    message.step = step
     message.bridges = step <= aligner.bridge and step <= MAX_STEPS * max(
         unit.usual[0], unit.usual[1]
     )
     for a in range(3):
-        message.rate[a], message.force[a] = rate[a], force[a]
-    unit.usual[0], unit.usual[1] = unit.usual[1], step
+        message.rate[a] = rate[a]
+        message.force[a] = force[a]
+    unit.usual[0] = unit.usual[1]
+    unit.usual[1] = step
     unit.newest = stamp
     unit.end += 1
     for k in range(aligner.n):
@@ -232,17 +245,22 @@ def _have_all_moved(aligner: Aligner, j: int, stamp: int) -> bool:
     This is so if all live units have left the time base, or most of them and none of
     these was ever in it.
     """
-    unit, timeout = aligner.units[j], aligner.timeout
+    unit = aligner.units[j]
+    timeout = aligner.timeout
     _count_refused(unit, stamp, aligner.common)
     if (unit.end > 0 and stamp == unit.newest) or not _is_outside(aligner, j, stamp):
         unit.off = False
         return False
     if not unit.off or not 0 <= stamp - unit.off_last <= timeout:
         unit.off_first = stamp
-    unit.off, unit.off_last = True, stamp
+    unit.off = True
+    unit.off_last = stamp
     for a in range(3):
-        unit.off_rate[a], unit.off_force[a] = aligner.rate[a], aligner.felt[a]
-    here, there, new = 0, 0, True
+        unit.off_rate[a] = aligner.rate[a]
+        unit.off_force[a] = aligner.felt[a]
+    here = 0
+    there = 0
+    new = True
     for i in range(aligner.n):
         if is_live(aligner, i) and _stands_at(aligner, aligner.units[i], stamp):
             there += 1
@@ -278,7 +296,8 @@ def _stands_at(aligner: Aligner, unit: Unit, stamp: int) -> bool:
 @compiled
 def _restart(aligner: Aligner) -> None:
     """Begin a new time base with the messages that have shown the move."""
-    stamp, newest = aligner.moved_to, aligner.common
+    stamp = aligner.moved_to
+    newest = aligner.common
     for j in range(aligner.n):
         if aligner.units[j].end > 0:
             newest = max(newest, aligner.units[j].newest)
@@ -287,7 +306,8 @@ def _restart(aligner: Aligner) -> None:
     aligner.common = stamp
     aligner.restarts += 1
     aligner.formed = False
-    aligner.phase, aligner.force = _FORMING, _NONE
+    aligner.phase = _FORMING
+    aligner.force = _NONE
     for j in range(aligner.n):
         unit = aligner.units[j]
         unit.begin = unit.end = unit.used = unit.usual[0] = unit.usual[1] = 0
@@ -328,16 +348,20 @@ def _form(aligner: Aligner, sample: Sample) -> bool:
         for j in range(aligner.n):
             if not _has_delivered(aligner, j, stamp, step):
                 return False
-    sample.stamp, sample.shift = stamp + aligner.shift, aligner.shift
+    sample.stamp = stamp + aligner.shift
+    sample.shift = aligner.shift
     parted = are_parted(aligner)
     for j in range(aligner.n):
         _add(aligner, j, stamp, step, sample)
         for a in range(3):
             if parted:
                 i = 3 * j + a
-                sample.z[i], sample.received[i] = math.nan, False
-                sample.force[i], sample.felt[i] = math.nan, False
-    aligner.formed, aligner.last = True, stamp
+                sample.z[i] = math.nan
+                sample.received[i] = False
+                sample.force[i] = math.nan
+                sample.felt[i] = False
+    aligner.formed = True
+    aligner.last = stamp
     return True
 
 
@@ -348,7 +372,8 @@ def _anchor(aligner: Aligner) -> tuple[int, int]:
     This is the earliest message for which no sample lies between itself and the
     previous one of its unit. The step is 0 if no message qualifies.
     """
-    stamp, step = _ALL, 0
+    stamp = _ALL
+    step = 0
     for j in range(aligner.n):
         unit = aligner.units[j]
         # Of each unit only the first two waiting messages can qualify, because samples
@@ -357,7 +382,8 @@ def _anchor(aligner: Aligner) -> tuple[int, int]:
             message = unit.messages[k % RING]
             if not aligner.formed or message.stamp - message.step >= aligner.last:
                 if message.stamp < stamp:
-                    stamp, step = message.stamp, message.step
+                    stamp = message.stamp
+                    step = message.step
                 break
     return stamp, step
 
@@ -377,11 +403,14 @@ def _add(aligner: Aligner, j: int, stamp: int, step: int, sample: Sample) -> Non
     unit = aligner.units[j]
     after = _after(unit, stamp)
     match = _match(unit, after, stamp, step, aligner.max_skew)
-    before, message = unit.messages[(after - 1) % RING], unit.messages[after % RING]
-    passed, received = stamp, True
+    before = unit.messages[(after - 1) % RING]
+    message = unit.messages[after % RING]
+    passed = stamp
+    received = True
     if match >= 0:
         message = unit.messages[match % RING]
-        unit.used, passed = match + 1, max(stamp, message.stamp)
+        unit.used = match + 1
+        passed = max(stamp, message.stamp)
         for a in range(3):
             sample.z[3 * j + a] = message.rate[a]
             sample.force[3 * j + a] = message.force[a]
@@ -478,7 +507,8 @@ def align_messages(
         Number of the next message to enter, and number of samples formed. With fewer
         than S samples, all messages were entered.
     """
-    aligner, count = rows[0], 0
+    aligner = rows[0]
+    count = 0
     while count < len(samples):
         if next_sample(aligner, samples[count]):
             count += 1
@@ -530,12 +560,10 @@ class Alignment:
             )
         self.units, self.rows = units, allocate(Aligner)  # the record, (1,)
         row = self.rows[0]
-        row["n"], row["max_skew"], row["timeout"], row["bridge"] = (
-            units,
-            max_skew,
-            timeout,
-            int(MAX_BRIDGE * timeout),
-        )
+        row["n"] = units
+        row["max_skew"] = max_skew
+        row["timeout"] = timeout
+        row["bridge"] = int(MAX_BRIDGE * timeout)
         row["units"]["delay"][: len(delays)] = [round(1e9 * delay) for delay in delays]
 
     def push(self, unit: int, stamp: int, rate: Sequence[float]) -> NDArray[Any]:
@@ -564,7 +592,8 @@ class Alignment:
 
     def flush(self) -> NDArray[Any]:
         """Return the remaining samples at the end of a recording, (S,) `Sample`."""
-        self.rows["phase"], self.rows["force"] = _FORMING, _ALL
+        self.rows["phase"] = _FORMING
+        self.rows["force"] = _ALL
         return self._aligned(
             np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 6))
         )
@@ -599,7 +628,8 @@ class Alignment:
     def _aligned(self, unit: Int, stamp: Int, values: Array) -> NDArray[Any]:
         if values.shape[1] == 3:
             values = np.hstack([values, np.full_like(values, np.nan)])
-        parts, start = [], 0
+        parts = []
+        start = 0
         while True:
             samples = allocate(Sample, min(len(stamp) - start + 64, 8192))
             start, count = align_messages(
@@ -615,7 +645,8 @@ def as_block(samples: NDArray[Any], units: int) -> Block:
 
     The block contains accelerations if any sample has one.
     """
-    stamp, n = samples["stamp"].copy(), 3 * units
+    stamp = samples["stamp"].copy()
+    n = 3 * units
 
     def half(values: str, there: str) -> Block:
         received = samples[there][:, :n].astype(np.bool_)

@@ -66,12 +66,15 @@ def restart_bias(core: NDArray[Any]) -> None:
     bias = core[0]["bias"]
     # Without a setting: 2 s, which reduces white noise to less than a tenth.
     bias["duration"] = bias["duration"] or 2_000_000_000
-    bias["learning"], bias["started"], bias["outcome"] = True, False, LEARNING
+    bias["learning"] = True
+    bias["started"] = False
+    bias["outcome"] = LEARNING
 
 
 def prepare_limits(bias: Any) -> None:
     """Write the ratios above which the vehicle was not at rest."""
-    bias["turn_ratio"], bias["sway_ratio"] = np.inf, np.inf
+    bias["turn_ratio"] = np.inf
+    bias["sway_ratio"] = np.inf
     for k in range(3, MAX_CHANNELS + 1):
         bias["turn_ratio"][k - 1] = f_quantile(FALSE_TURN, 3, k - 3 + PRIOR)
         if k > 3:
@@ -109,7 +112,9 @@ def update_bias(
     that are finite and in range. ``lost`` is the mask of channels declared faulty or
     taken out, which are no evidence about rest and keep their bias.
     """
-    average, n, z = core.bias, core.settings.n, core.now.aligned
+    average = core.bias
+    n = core.settings.n
+    z = core.now.aligned
     if average.started and stamp >= average.start + average.duration:
         conclude(core, subsets, lost)
         if not average.learning:
@@ -132,7 +137,9 @@ def update_bias(
 @compiled
 def begin(average: Bias, n: int, stamp: int) -> None:
     """Begin a new average."""
-    average.started, average.start, average.rows = True, stamp, 0
+    average.started = True
+    average.start = stamp
+    average.rows = 0
     for i in range(n):
         average.count[i] = average.groups[i].count = 0
         for b in range(BIAS_PORTIONS):
@@ -149,7 +156,8 @@ def add_value(group: ValueGroup, portion: Portion, i: int, value: float) -> None
     group.count += 1
     group.total += value
     group.squares += value * value
-    group.low, group.high = min(group.low, value), max(group.high, value)
+    group.low = min(group.low, value)
+    group.high = max(group.high, value)
     if group.count == GROUP:
         group.count = 0
         middle = (group.total - group.low - group.high) / (GROUP - 2)
@@ -168,7 +176,8 @@ def middle_mean(values: Array, count: int) -> float:
     The values are sorted in place.
     """
     for k in range(1, count):
-        value, j = values[k], k
+        value = values[k]
+        j = k
         while j > 0 and values[j - 1] > value:
             values[j] = values[j - 1]
             j -= 1
@@ -212,7 +221,8 @@ def average_channel(average: Bias, i: int) -> bool:
 @compiled
 def begin_in_motion(average: Bias, n: int) -> None:
     """End the start-up average in motion: begin with the biases of the settings."""
-    average.learning, average.outcome = False, IN_MOTION
+    average.learning = False
+    average.outcome = IN_MOTION
     for i in range(n):
         average.value[i] = average.centre[i]
     average.known = (1 << n) - 1
@@ -221,7 +231,8 @@ def begin_in_motion(average: Bias, n: int) -> None:
 @compiled
 def conclude(core: Core, subsets: NDArray[Any], lost: int) -> None:
     """Set the bias if the vehicle was at rest, or else store the reason."""
-    average, n = core.bias, core.settings.n
+    average = core.bias
+    n = core.settings.n
     heard = at_rest = resting = restless = 0
     for i in range(n):
         enough = average_channel(average, i)
@@ -240,7 +251,8 @@ def conclude(core: Core, subsets: NDArray[Any], lost: int) -> None:
             else:
                 restless += 1
     average.started = False
-    average.heard, average.restless = heard, heard & ~at_rest
+    average.heard = heard
+    average.restless = heard & ~at_rest
     moved = moves_together(core, subsets[at_rest], at_rest, resting)
     # One restless channel is a bad channel. More than one indicate a moving vehicle.
     if restless <= 1 and resting >= 3 and average.rows >= LEAST_ROWS and not moved:
@@ -248,7 +260,8 @@ def conclude(core: Core, subsets: NDArray[Any], lost: int) -> None:
             if at_rest >> i & 1:
                 average.value[i] = average.average[i]
         average.known = at_rest | lost
-        average.learning, average.outcome = False, LEARNED
+        average.learning = False
+        average.outcome = LEARNED
     else:
         average.outcome = NOT_AT_REST if average.restless or moved else TOO_FEW
 
@@ -259,7 +272,9 @@ def moves_together(core: Core, subset: Subset, mask: int, k: int) -> bool:
 
     The size of the rotation and its limits are stored.
     """
-    average, sensors, parity = core.bias, core.settings.sensors, core.now.parity
+    average = core.bias
+    sensors = core.settings.sensors
+    parity = core.now.parity
     average.common_rate = average.sway = 0.0
     average.max_common_rate = average.max_sway = math.inf
     if not subset.spans:
@@ -298,7 +313,9 @@ def split(core: Core, mask: int) -> tuple[float, float, float]:
     Return the length of the rate, and the sums of squares of the explained part and of
     the rest.
     """
-    axes, part, rate = core.settings.sensors.axes, core.bias.part, core.bias.turn
+    axes = core.settings.sensors.axes
+    part = core.bias.part
+    rate = core.bias.turn
     apply_gain(core.now.parity.gain, core.settings.n, part, rate)
     explained = other = 0.0
     for i in range(core.settings.n):
@@ -319,7 +336,11 @@ def split_portions(core: Core, mask: int) -> tuple[float, float, int]:
 
     Return the sums of squares of both parts, and the number of portions.
     """
-    average, n, count, explained, other = core.bias, core.settings.n, 0, 0.0, 0.0
+    average = core.bias
+    n = core.settings.n
+    count = 0
+    explained = 0.0
+    other = 0.0
     for i in range(n):
         average.middle[i] = 0.0
     for b in range(BIAS_PORTIONS):

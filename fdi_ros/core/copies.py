@@ -64,10 +64,8 @@ def is_copy(
     copies: Copies, settings: PathSettings, line: DelayBuffer, a: int, b: int
 ) -> bool:
     """Return whether one of two units delivers present or earlier values of the other."""
-    first, second = (
-        first_of_three(settings.members[a]),
-        first_of_three(settings.members[b]),
-    )
+    first = first_of_three(settings.members[a])
+    second = first_of_three(settings.members[b])
     if first < 0 or second < 0:
         return False
     for lag in range(min(MAX_LAG, min(line.count, RESTAMP_SAMPLES) - ROWS - 2) + 1):
@@ -113,11 +111,14 @@ def sum_changes(
     bool
         Whether that many changes are within twice as many samples.
     """
-    change, products, count = copies.change, copies.products, 0
+    change = copies.change
+    products = copies.products
+    count = 0
     for i in range(6):
         for j in range(6):
             products[i, j] = 0.0
-    newest, oldest = line.count - 1, max(line.count - RESTAMP_SAMPLES, 0)
+    newest = line.count - 1
+    oldest = max(line.count - RESTAMP_SAMPLES, 0)
     for k in range(newest, max(newest - 2 * wanted, oldest + lag + 1), -1):
         if not (
             fill_change(line, source, k - lag, change, 0)
@@ -139,7 +140,8 @@ def fill_change(line: DelayBuffer, first: int, k: int, out: Array, place: int) -
 
     Return whether all values are finite and in range.
     """
-    new, middle = line.rows[k % RESTAMP_SAMPLES], line.rows[(k - 1) % RESTAMP_SAMPLES]
+    new = line.rows[k % RESTAMP_SAMPLES]
+    middle = line.rows[(k - 1) % RESTAMP_SAMPLES]
     old = line.rows[(k - 2) % RESTAMP_SAMPLES]
     for i in range(3):
         out[place + i] = (
@@ -159,7 +161,10 @@ def is_explained(
     The changes must also be noise. Elimination of the channels of the first unit leaves
     the unexplained part of the second.
     """
-    products, noise, size, trace = copies.products, 0.0, 0.0, 0.0
+    products = copies.products
+    noise = 0.0
+    size = 0.0
+    trace = 0.0
     for i in range(3):
         copies.change[i] = products[3 + i, 3 + i]
         size += products[3 + i, 3 + i]
@@ -185,11 +190,9 @@ def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
     Each series has shape (N, 3), in rad/s, and all have the same sample rate.
     """
     found = []
-    line, copies, settings = (
-        allocate(DelayBuffer),
-        allocate(Copies),
-        allocate(PathSettings),
-    )
+    line = allocate(DelayBuffer)
+    copies = allocate(Copies)
+    settings = allocate(PathSettings)
     settings["members"][0, :2] = 0b111, 0b111000
     rows = line["rows"][0]
     for a, b in itertools.combinations(range(len(series)), 2):

@@ -60,7 +60,8 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
     else:
         wanted = decision.ambiguous | undecided
     follow_declared(settings, decision, evidence)
-    returns, clears = 0, False
+    returns = 0
+    clears = False
     if not settings.latch:
         returns = update_returns(settings, decision, evidence.stamp)
         clears = (
@@ -109,7 +110,8 @@ def push(
     if decision.sets[COUNTED, decision.at]:
         decision.alarms -= 1
     for kind in range(4):
-        new, old = sets[kind], decision.sets[kind, decision.at]
+        new = sets[kind]
+        old = decision.sets[kind, decision.at]
         decision.sets[kind, decision.at] = new
         if new != old:
             for i in range(settings.n):
@@ -161,8 +163,10 @@ def follow_declared(
         is_declared = decision.faulty >> i & 1 and not settings.latch
         if not is_declared or evidence.interrupted or not evidence.agrees >> i & 1:
             decision.last_bad[i] = decision.renewed[i] = evidence.stamp
-            decision.error_sum[i], decision.error_count[i] = 0.0, 0
-            decision.earlier_sum[i], decision.earlier_count[i] = 0.0, 0
+            decision.error_sum[i] = 0.0
+            decision.error_count[i] = 0
+            decision.earlier_sum[i] = 0.0
+            decision.earlier_count[i] = 0
         else:
             decision.error_sum[i] += min(max(evidence.error[i], -MAX_RATE), MAX_RATE)
             decision.error_count[i] += 1
@@ -187,15 +191,11 @@ def update_returns(settings: PathSettings, decision: Decision, stamp: int) -> in
             ):
                 returns |= 1 << i
             elif stamp - decision.renewed[i] >= settings.clean_time:
-                decision.earlier_sum[i], decision.earlier_count[i] = (
-                    decision.error_sum[i],
-                    decision.error_count[i],
-                )
-                decision.error_sum[i], decision.error_count[i], decision.renewed[i] = (
-                    0.0,
-                    0,
-                    stamp,
-                )
+                decision.earlier_sum[i] = decision.error_sum[i]
+                decision.earlier_count[i] = decision.error_count[i]
+                decision.error_sum[i] = 0.0
+                decision.error_count[i] = 0
+                decision.renewed[i] = stamp
     return returns
 
 
@@ -222,7 +222,8 @@ def clear_declarations(core: NDArray[Any]) -> int:
 
     ``core`` has shape (1,).
     """
-    decision, settings = core[0].decision, core[0].settings
+    decision = core[0].decision
+    settings = core[0].settings
     declared = decision.faulty | decision.ambiguous
     decision.faulty = decision.ambiguous = decision.voted = decision.suspicion = 0
     for i in range(settings.n):

@@ -31,12 +31,10 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
 
     Return the mask of stuck channels.
     """
-    settings, health, now, evidence = (
-        core.settings,
-        core.health,
-        core.now,
-        core.now.evidence,
-    )
+    settings = core.settings
+    health = core.health
+    now = core.now
+    evidence = core.now.evidence
     evidence.judged = not math.isnan(now.verdict.statistic)
     evidence.checked = subsets[core.sample.mask].detectable if evidence.judged else 0
     evidence.checked &= core.sample.estimate.checked
@@ -72,13 +70,13 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
 @compiled
 def fill_suspects(core: Core, stuck: int) -> None:
     """Write the channels suspected by the verdict or by repeated values."""
-    settings, now, evidence, verdict = (
-        core.settings,
-        core.now,
-        core.now.evidence,
-        core.now.verdict,
-    )
-    n, evidence.certain, evidence.undecided = settings.n, 0, 0
+    settings = core.settings
+    now = core.now
+    evidence = core.now.evidence
+    verdict = core.now.verdict
+    n = settings.n
+    evidence.certain = 0
+    evidence.undecided = 0
     evidence.outliers = bits_of(verdict.outliers, n) | now.repeated | evidence.flickers
     if settings.by_evidence and verdict.alarm and not evidence.held:
         if verdict.isolated:
@@ -93,24 +91,25 @@ def fill_suspects(core: Core, stuck: int) -> None:
     update_drifted(settings, core.sample, now)
     evidence.certain |= evidence.drifted
     add_stuck(settings, now, stuck)
-    evidence.suspected, evidence.isolated = (
-        bits_of(verdict.suspects, n),
-        verdict.isolated,
-    )
+    evidence.suspected = bits_of(verdict.suspects, n)
+    evidence.isolated = verdict.isolated
     if settings.by_evidence:
-        evidence.suspected, evidence.isolated = stuck, stuck & (stuck - 1) == 0
+        evidence.suspected = stuck
+        evidence.isolated = stuck & (stuck - 1) == 0
 
 
 @compiled
 def update_drifted(settings: PathSettings, sample: SampleInput, now: Current) -> None:
     """Find channels whose bias certainly exceeds ``max_drift``, and add them as suspects."""
-    now.evidence.drifted, estimate = 0, sample.estimate
+    now.evidence.drifted = 0
+    estimate = sample.estimate
     if settings.max_drift > 0.0 and estimate.known:
         for i in range(settings.n):
             bias = abs(estimate.bias[i]) - SURE_DRIFT * estimate.bias_std[i]
             if sample.mask >> i & 1 and bias > settings.max_drift:
                 now.evidence.drifted |= 1 << i
-                now.verdict.suspects[i], now.verdict.error[i] = True, estimate.bias[i]
+                now.verdict.suspects[i] = True
+                now.verdict.error[i] = estimate.bias[i]
 
 
 @compiled

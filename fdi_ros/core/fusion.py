@@ -34,7 +34,9 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
 
     If too few remain, doubtful channels are fused as well, or no rate is given.
     """
-    settings, last, now = core.settings, core.last, core.now
+    settings = core.settings
+    last = core.last
+    now = core.now
     n = settings.n
     now.fused = choose_fused(settings, core.health, now, subsets, doubtful)
     subset = subsets[now.fused]
@@ -99,10 +101,12 @@ def choose_fused(
         if not subsets[trusted].spare:
             trusted = usable
         if doubtful & trusted and not settings.publish_under_doubt:
-            now.withheld, trusted = True, 0
+            now.withheld = True
+            trusted = 0
     if now.all_repeat and not is_at_rest(settings, now):
         # A turning vehicle does not repeat values exactly: repeated values are old.
-        now.withheld, trusted = True, 0
+        now.withheld = True
+        trusted = 0
     return trusted
 
 
@@ -126,7 +130,8 @@ def update_gain(
     subset: Subset,
 ) -> None:
     """Calculate the variance of every channel, and the gain of the fused channels."""
-    n, sensors = settings.n, settings.sensors
+    n = settings.n
+    sensors = settings.sensors
     for i in range(n):
         now.variance[i] = estimate.variance[i]
         if not estimate.known:
@@ -189,8 +194,11 @@ def update_common_error(core: Core) -> None:
     C is the covariance of the errors. ``B = G C G'`` is written to ``now.common``, and
     the square roots of the diagonal of ``(I - H G) C (I - H G)'`` to ``core.remaining``.
     """
-    n, axes = core.settings.n, core.settings.sensors.axes
-    gain, common, shared = core.now.gain, core.now.common, core.now.shared_error
+    n = core.settings.n
+    axes = core.settings.sensors.axes
+    gain = core.now.gain
+    common = core.now.common
+    shared = core.now.shared_error
     covariance = core.sample.estimate.covariance
     for i in range(n):
         for a in range(3):
@@ -201,7 +209,9 @@ def update_common_error(core: Core) -> None:
             common[k] = dot(gain[a], shared[:, c], n)
             k += 1
     for i in range(n):
-        x, y, z = axes[i, 0], axes[i, 1], axes[i, 2]
+        x = axes[i, 0]
+        y = axes[i, 1]
+        z = axes[i, 2]
         along_axis = (
             x * x * common[0]
             + y * y * common[3]

@@ -29,14 +29,18 @@ def give_sample(core: Core, gyros: Core, sample: Sample, half: int) -> None:
     ``gyros`` is the core of the gyros. For the accelerometers, the gyros of the same
     sample must have been processed.
     """
-    given, settings = core.given, core.settings
-    given.stamp, given.shift = sample.stamp, sample.shift
+    given = core.given
+    settings = core.settings
+    given.stamp = sample.stamp
+    given.shift = sample.shift
     for i in range(settings.n):
         if half == 0:
-            given.z[i], given.received[i] = sample.z[i], sample.received[i]
+            given.z[i] = sample.z[i]
+            given.received[i] = sample.received[i]
         else:
             place = settings.places[i]
-            given.z[i], given.received[i] = sample.force[place], sample.felt[place]
+            given.z[i] = sample.force[place]
+            given.received[i] = sample.felt[place]
     if half == 1:
         if settings.lever:
             take_off_lever_arms(core, gyros, given.z)
@@ -66,16 +70,20 @@ def displaced_variance(core: Core, i: int) -> float:
     A displacement r adds ``r . v`` along the axis h, with ``v = h x alpha + omega
     (omega . h) - omega^2 h``.
     """
-    settings, turning = core.settings, core.turning
+    settings = core.settings
+    turning = core.turning
     variance = settings.position_variance[i]
     if variance == 0.0:
         return 0.0
-    omega, alpha, h = turning.rate, turning.acceleration, settings.sensors.axes[i]
+    omega = turning.rate
+    alpha = turning.acceleration
+    h = settings.sensors.axes[i]
     along = omega[0] * h[0] + omega[1] * h[1] + omega[2] * h[2]
     speed = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
     square = 0.0
     for a in range(3):
-        b, c = (a + 1) % 3, (a + 2) % 3
+        b = (a + 1) % 3
+        c = (a + 2) % 3
         by = h[b] * alpha[c] - h[c] * alpha[b] + omega[a] * along - speed * h[a]
         square += by * by
     return float(variance * square / settings.natural**2)
@@ -84,14 +92,18 @@ def displaced_variance(core: Core, i: int) -> float:
 @compiled
 def take_off_lever_arms(core: Core, gyros: Core, force: Array) -> None:
     """Subtract the accelerations by rotation of the body at each accelerometer, m/s^2."""
-    omega, alpha, settings = gyros.last.rate, gyros.acceleration.value, core.settings
+    omega = gyros.last.rate
+    alpha = gyros.acceleration.value
+    settings = core.settings
     if not math.isfinite(omega[0]):
         return
     for i in range(settings.n):
-        arm, axis = settings.arms[i], settings.sensors.axes[i]
+        arm = settings.arms[i]
+        axis = settings.sensors.axes[i]
         along = omega[0] * arm[0] + omega[1] * arm[1] + omega[2] * arm[2]
         square = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
         for a in range(3):
-            b, c = (a + 1) % 3, (a + 2) % 3
+            b = (a + 1) % 3
+            c = (a + 2) % 3
             turning = alpha[b] * arm[c] - alpha[c] * arm[b]
             force[i] -= axis[a] * (turning + omega[a] * along - square * arm[a])

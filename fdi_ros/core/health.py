@@ -24,7 +24,9 @@ NOT_BAD = -(1 << 62)  #: In place of the start of a run of non-finite values.
 @compiled
 def check(settings: PathSettings, health: Health, sample: Sample) -> None:
     """Check the values of one sample. The results are in ``health.condition``."""
-    n, stamp, received = settings.n, sample.stamp, sample.received
+    n = settings.n
+    stamp = sample.stamp
+    received = sample.received
     if health.begun == 0:
         for i in range(n):
             health.value[i] = math.nan
@@ -87,7 +89,8 @@ def receive(
         if change > 0.0 and (change < health.step[i] or health.step[i] == 0.0):
             health.step[i] = change
         follow_rail(settings, health, i, z)
-        health.value[i], health.bad_stamp[i] = z, NOT_BAD
+        health.value[i] = z
+        health.bad_stamp[i] = NOT_BAD
         return OUT_OF_RANGE if abs(z) >= health.limit[i] else FINE
     if health.bad_stamp[i] == NOT_BAD or hole:
         health.bad_stamp[i] = stamp
@@ -188,7 +191,8 @@ def follow_presence(
     for i in range(n):
         if health.begun == 1:
             # The channel is still unknown.
-            health.absent[i], health.complete_stamp[i] = 1.0, stamp
+            health.absent[i] = 1.0
+            health.complete_stamp[i] = stamp
         health.absent[i] += adaptation_gain * (
             (0.0 if received[i] else 1.0) - health.absent[i]
         )
@@ -218,7 +222,9 @@ def intermittent_channels(gone: Array, leaves: Array, n: int, share: float) -> i
 @compiled
 def leave_flickering(core: Core, subsets: NDArray[Any]) -> None:
     """Leave channels whose values come and go out of the sample, if enough remain."""
-    now, health, n = core.now, core.health, core.settings.n
+    now = core.now
+    health = core.health
+    n = core.settings.n
     # Also channels that were complete, and now lack samples repeatedly.
     sparse = health.complete & intermittent_channels(
         health.absent, health.lapses, n, INTERMITTENT_SHARE

@@ -50,7 +50,8 @@ def judge_sample(
     The other fields of the sample must be filled in. Return False, without judging, if
     the constants of the set are not prepared.
     """
-    mask, judged = sample.mask, bank.judged
+    mask = sample.mask
+    judged = bank.judged
     row = 0 if bank.takes_any else bank.row[mask]
     if row == UNPREPARED:
         return False
@@ -81,20 +82,18 @@ def judge_sample(
         sample,
         judged,
     )
-    verdict.statistic, verdict.threshold = judged.statistic, judged.threshold
-    verdict.alarm, verdict.isolated = judged.alarm, judged.isolated
+    verdict.statistic = judged.statistic
+    verdict.threshold = judged.threshold
+    verdict.alarm = judged.alarm
+    verdict.isolated = judged.isolated
     k = 0
     for i in range(bank.n):
         if bank.takes_any or mask >> i & 1:
-            verdict.suspects[i], verdict.outliers[i] = (
-                judged.suspects[k],
-                judged.outliers[k],
-            )
-            verdict.error[i], verdict.scores[i], verdict.noise[i] = (
-                judged.error[k],
-                judged.scores[k],
-                judged.noise[k],
-            )
+            verdict.suspects[i] = judged.suspects[k]
+            verdict.outliers[i] = judged.outliers[k]
+            verdict.error[i] = judged.error[k]
+            verdict.scores[i] = judged.scores[k]
+            verdict.noise[i] = judged.noise[k]
             k += 1
     return True
 
@@ -113,9 +112,12 @@ def judge_corrected(core: Core, bank: Bank) -> None:
     Residuals are divided by the square root of the excess of the present noise, so that
     the method keeps its false-alarm rate. Noise and outliers are those of the estimator.
     """
-    now, asked, axes = core.now, core.now.asked, core.settings.sensors.axes
+    now = core.now
+    asked = core.now.asked
+    axes = core.settings.sensors.axes
     scale = math.sqrt(max(core.sample.estimate.excess, 1.0))
-    asked.stamp, asked.mask = core.sample.stamp, core.sample.mask
+    asked.stamp = core.sample.stamp
+    asked.mask = core.sample.mask
     for i in range(core.settings.n):
         expected = along(axes[i], now.rate)
         now.scaled[i] = expected + (now.corrected[i] - expected) / scale
@@ -129,9 +131,12 @@ def judge_corrected(core: Core, bank: Bank) -> None:
 @compiled
 def take_verdict(now: Current, n: int) -> None:
     """Copy the verdict of the estimator's own detector to the one that declares."""
-    source, target = now.guard, now.verdict
-    target.statistic, target.threshold = source.statistic, source.threshold
-    target.alarm, target.isolated = source.alarm, source.isolated
+    source = now.guard
+    target = now.verdict
+    target.statistic = source.statistic
+    target.threshold = source.threshold
+    target.alarm = source.alarm
+    target.isolated = source.isolated
     for i in range(n):
         target.suspects[i] = source.suspects[i]
         target.outliers[i] = source.outliers[i]

@@ -62,10 +62,12 @@ def fill_level(subset: Subset, n: int, mask: int, growth: Array, level: Array) -
     gives ``level sqrt(sum_i p_i growth_i)`` with weights p that sum to one.
     ``subset.share`` contains the largest p_i over all functions.
     """
-    least, most = math.inf, 0.0
+    least = math.inf
+    most = 0.0
     for i in range(n):
         if mask >> i & 1:
-            least, most = min(least, growth[i]), max(most, growth[i])
+            least = min(least, growth[i])
+            most = max(most, growth[i])
     for a in range(3):
         total = least
         for i in range(n):
@@ -88,7 +90,8 @@ def passes_test(
 
     The protection level presumes that they do.
     """
-    passes, least = True, math.inf
+    passes = True
+    least = math.inf
     for i in range(n):
         if mask >> i & 1:
             least = min(least, growth[i])
@@ -116,7 +119,9 @@ APART = 1e-3
 @compiled
 def cover_rivals(core: Core) -> None:
     """Raise ``core.last.level`` to a bound that also holds if a name or the set is wrong."""
-    now, decision, n = core.now, core.decision, core.settings.n
+    now = core.now
+    decision = core.decision
+    n = core.settings.n
     fill_parity(now.parity, core.settings.sensors, now.fused, now.uncertainty)
     chi = chi_of(now.parity, n, now.fused, now.corrected)
     for i in range(n):
@@ -155,7 +160,9 @@ def cover(core: Core, out: int, chi: float) -> None:
 
     ``chi`` is the chi-square of the fused channels.
     """
-    n, now, information = core.settings.n, core.now, core.now.parity.information
+    n = core.settings.n
+    now = core.now
+    information = core.now.parity.information
     mask = now.fused | out
     fill_parity(now.parity, core.settings.sensors, mask, now.uncertainty)
     for i in range(n):
@@ -179,7 +186,8 @@ def cover_single(core: Core, i: int, base: float) -> None:
 
     ``base`` is the logarithm of the odds of a fault that explains no residual.
     """
-    information, u = core.now.parity.information[i, i], core.now.rival[i]
+    information = core.now.parity.information[i, i]
+    u = core.now.rival[i]
     # With less, no residual shows the channel.
     if information * core.now.uncertainty[i] > APART:
         log_odds = base + 0.5 * u * u / information
@@ -194,9 +202,13 @@ def cover_single(core: Core, i: int, base: float) -> None:
 @compiled
 def cover_pair(core: Core, i: int, j: int, base: float) -> None:
     """Raise the level for faults of channels i and j, with base as in `cover_single`."""
-    information, prior = core.now.parity.information, core.settings.prior
-    a, b, c = information[i, i], information[j, j], information[i, j]
-    u, v = core.now.rival[i], core.now.rival[j]
+    information = core.now.parity.information
+    prior = core.settings.prior
+    a = information[i, i]
+    b = information[j, j]
+    c = information[i, j]
+    u = core.now.rival[i]
+    v = core.now.rival[j]
     determinant = a * b - c * c
     # Two channels that look alike are covered by the single faults.
     if determinant > APART * a * b:
@@ -212,9 +224,12 @@ def cover_rival(core: Core, rival: Rival) -> None:
     """Raise the level of each axis to a bound that holds if the rival is true."""
     if rival.log_odds <= 0.0:
         return
-    now, last, parity = core.now, core.last, core.now.parity
+    now = core.now
+    last = core.last
+    parity = core.now.parity
     for a in range(3):
-        g, h = parity.gain[a, rival.first], parity.gain[a, rival.second]
+        g = parity.gain[a, rival.first]
+        h = parity.gain[a, rival.second]
         rate = gained_rate(parity.gain[a], now.corrected, core.settings.n)
         off = abs(last.rate[a] - rate + g * rival.error[0] + h * rival.error[1])
         variance = (
@@ -238,10 +253,13 @@ def update_level(core: Core, subsets: NDArray[Any]) -> None:
     test fails. If the level of the fused channels has not been calculated yet,
     ``core.wanted`` is set to their mask.
     """
-    last, now, subset = core.last, core.now, subsets[core.now.fused]
+    last = core.last
+    now = core.now
+    subset = subsets[core.now.fused]
     passes = last.valid != 0 and not now.all_repeat and not now.doubtful & now.fused
     core.wanted = now.fused if passes and not subset.has_level else 0
-    n, sensors = core.settings.n, core.settings.sensors
+    n = core.settings.n
+    sensors = core.settings.sensors
     fill_growth(n, sensors.noise_std, now.variance, core.remaining, now.growth)
     fill_level(subset, n, now.fused, now.growth, last.level)
     if not passes or not passes_test(

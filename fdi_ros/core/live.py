@@ -67,7 +67,8 @@ def receive_stamped(
         inlet.error = -stamp
         inlet.malformed += 1
         return MALFORMED
-    inlet.error, inlet.stamp = GOOD, stamp
+    inlet.error = GOOD
+    inlet.stamp = stamp
     if now > 0 and stamp - now > AHEAD_OF_CLOCK:
         aligner.units[unit].counters.ahead += 1
         return MORE if live.ready else 0
@@ -137,7 +138,8 @@ def fill_accelerometers(
     paths: tuple[Path, Path], live: Live, fused: Bytes, integrity: Bytes
 ) -> None:
     """Write the results of the accelerometers into the messages on the last sample."""
-    gyros, core = paths[0].core[0].settings, paths[1].core[0]
+    gyros = paths[0].core[0].settings
+    core = paths[1].core[0]
     natural = core.settings.natural
     if core.last.valid:
         fill_force(fused, live.fused_at, natural, core.last.rate, core.last.covariance)
@@ -168,7 +170,8 @@ def process(
     fused, integrity
         Receive the messages to publish.
     """
-    monitor, main = live[0], paths[0].core[0]
+    monitor = live[0]
+    main = paths[0].core[0]
     if not monitor.ready:
         return 0
     sample = monitor.sample

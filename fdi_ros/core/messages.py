@@ -142,7 +142,8 @@ def read_rate(
         return at
     little = data[offset + 1] == 1
     both = read_bits(data, offset + ENCAPSULATION, 8, little)
-    first, second = both >> 32 & 0xFFFFFFFF, both & 0xFFFFFFFF
+    first = both >> 32 & 0xFFFFFFFF
+    second = both & 0xFFFFFFFF
     sec, nanosec = (second, first) if little else (first, second)
     if sec >= _SIGN or nanosec >= _NS:
         return -BAD_STAMP
@@ -234,7 +235,8 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
     covariance
         Upper triangle of the covariance, (rad/s)^2, (6,).
     """
-    seconds, rest = stamp // _NS, stamp % _NS
+    seconds = stamp // _NS
+    rest = stamp % _NS
     for k in range(4):
         out[ENCAPSULATION + k] = seconds >> 8 * k & 255
         out[ENCAPSULATION + 4 + k] = rest >> 8 * k & 255

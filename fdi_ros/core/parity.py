@@ -78,7 +78,8 @@ def fill_joint_parity(
     ``covariance`` (n, n) is that of the errors, (rad/s)^2, and ``known`` the prior
     information k of the rate, s^2/rad^2.
     """
-    n, count = sensors.n, 0
+    n = sensors.n
+    count = 0
     for i in range(n):
         if mask >> i & 1:
             parity.place[count] = i

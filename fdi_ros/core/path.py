@@ -173,7 +173,8 @@ def step(path: Path, sample: Sample, row: int, events: NDArray[Any], count: int)
     Return the number of events, or `WAITING`: then the same sample must be passed again
     after the detector was prepared.
     """
-    core, method = path.core[0], path.method[0]
+    core = path.core[0]
+    method = path.method[0]
     now = core.now
     if not now.waiting:
         prepare_sample(path, sample)
@@ -206,8 +207,11 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     the detector gets values of an earlier instant, interpolated between this and
     earlier samples, which were checked as well.
     """
-    core, subsets = path.core[0], path.subsets
-    settings, now, stamp = core.settings, core.now, sample.stamp
+    core = path.core[0]
+    subsets = path.subsets
+    settings = core.settings
+    now = core.now
+    stamp = sample.stamp
     now.evidence.stamp = stamp
     now.evidence.interrupted = (
         core.samples == 0 or stamp - core.last_stamp > settings.stale_time
@@ -223,7 +227,8 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     if now.learned_from:
         return
     out = out_of_use(core)
-    now.plain, now.in_use = plain, plain & ~out
+    now.plain = plain
+    now.in_use = plain & ~out
     now.usable = now.in_use & fine
     leave_flickering(core, subsets)
     for i in range(settings.n):
@@ -231,7 +236,9 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     fill_rate(subsets[now.in_use], settings.n, now.in_use, now.corrected, now.rate)
     fill_input(core, out)
     given = core.sample
-    given.stamp, given.out, given.interrupted = stamp, out, now.evidence.interrupted
+    given.stamp = stamp
+    given.out = out
+    given.interrupted = now.evidence.interrupted
     given.beyond = given.mask & ~now.usable
     given.held = (
         core.saturated and stamp - core.saturated_stamp <= settings.recovery_time
@@ -251,7 +258,8 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
 
     Return the masks of the channels in range, and of the channels without a defect.
     """
-    settings, aligned = core.settings, core.now.aligned
+    settings = core.settings
+    aligned = core.now.aligned
     delivered = inside = plain = fine = 0
     for i in range(settings.n):
         if sample.received[i]:
@@ -281,7 +289,8 @@ def learn_bias(path: Path, stamp: int, plain: int) -> None:
 
     ``now.learned_from`` is set if the average uses the sample.
     """
-    core, subsets = path.core[0], path.subsets
+    core = path.core[0]
+    subsets = path.subsets
     bias = core.bias
     core.now.learned_from = update_bias(core, subsets, stamp, plain, left_out(core))
     if bias.learning and bias.outcome == NOT_AT_REST:
@@ -295,7 +304,8 @@ def learn_bias(path: Path, stamp: int, plain: int) -> None:
 @compiled
 def apply_estimate(core: Core) -> None:
     """Correct ``now.corrected`` with the present estimate of the sensor errors."""
-    now, estimate = core.now, core.sample.estimate
+    now = core.now
+    estimate = core.sample.estimate
     for i in range(core.settings.n if estimate.known else 0):
         if math.isfinite(now.input[i]):
             now.corrected[i] = estimate.corrected[i]
@@ -312,11 +322,9 @@ def update_noisy(core: Core) -> None:
     A noisy channel must also be noisier than all distinguishable channels of other
     units.
     """
-    settings, noise, usual = (
-        core.settings,
-        core.now.verdict.noise,
-        core.health.usual_noise,
-    )
+    settings = core.settings
+    noise = core.now.verdict.noise
+    usual = core.health.usual_noise
     core.now.noisy = 0
     for i in range(settings.n):
         if noise[i] > 0.0:
@@ -351,12 +359,10 @@ def unit_of(settings: PathSettings, i: int) -> int:
 @compiled
 def begin_bias(core: Core) -> None:
     """Initialise the estimation of biases after the start-up average."""
-    n, settings, motion, largest = (
-        core.settings.n,
-        core.settings,
-        core.bias.outcome == IN_MOTION,
-        0.0,
-    )
+    n = core.settings.n
+    settings = core.settings
+    motion = core.bias.outcome == IN_MOTION
+    largest = 0.0
     lost = left_out(core)
     for i in range(n):
         largest = max(largest, core.health.step[i])
@@ -380,7 +386,9 @@ def fill_input(core: Core, out: int) -> None:
     recover from its limit, and such a manoeuvre is beyond the error model. Meanwhile a
     channel that disagrees is left out, but not declared.
     """
-    now, axes, rate = core.now, core.settings.sensors.axes, core.now.rate
+    now = core.now
+    axes = core.settings.sensors.axes
+    rate = core.now.rate
     core.sample.mask = now.usable
     for i in range(core.settings.n):
         now.along[i] = along(axes[i], rate)
@@ -397,7 +405,8 @@ def fill_input(core: Core, out: int) -> None:
                 )
                 core.sample.mask |= 1 << i
             else:
-                core.saturated, core.saturated_stamp = True, now.evidence.stamp
+                core.saturated = True
+                core.saturated_stamp = now.evidence.stamp
 
 
 @compiled
@@ -406,8 +415,12 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
 
     Return the number of events.
     """
-    core, subsets = path.core[0], path.subsets
-    settings, now, last, verdict = core.settings, core.now, core.last, core.now.verdict
+    core = path.core[0]
+    subsets = path.subsets
+    settings = core.settings
+    now = core.now
+    last = core.last
+    verdict = core.now.verdict
     last.stamp = now.evidence.stamp
     if now.learned_from:
         skip_sample(core)
@@ -431,11 +444,9 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
         core.decision, settings, CHECKED, settings.alarms
     )
     update_states(core, checked, 0 if changed else core.decision.suspicion, False)
-    last.statistic, last.threshold, last.alarm = (
-        verdict.statistic,
-        verdict.threshold,
-        verdict.alarm,
-    )
+    last.statistic = verdict.statistic
+    last.threshold = verdict.threshold
+    last.alarm = verdict.alarm
     update_level(core, subsets)
     return write_events(core, subsets[living], row, False, events, count)
 
@@ -450,7 +461,8 @@ def skip_sample(core: Core) -> None:
     update_states(core, 0, 0, True)
     last.instant = max(last.stamp, last.instant + 1)
     for a in range(3):
-        last.rate[a], last.level[a] = math.nan, math.inf
+        last.rate[a] = math.nan
+        last.level[a] = math.inf
     for k in range(6):
         last.covariance[k] = math.nan
     last.statistic = last.threshold = math.nan

@@ -52,7 +52,8 @@ def leave_one_out(settings: PathSettings, now: Current, subset: Subset) -> None:
 
     NaN if the others do not predict the channel.
     """
-    axes, rate = settings.sensors.axes, now.others_rate
+    axes = settings.sensors.axes
+    rate = now.others_rate
     for i in range(settings.n):
         expected = along(axes[i], rate)
         share = subset.sensitivity[i]
@@ -78,7 +79,9 @@ def fill_disagreement(
     settings: PathSettings, now: Current, subset: Subset, mask: int
 ) -> None:
     """Write for each channel the sum of squared residuals of the others in the mask."""
-    axes, rate, total = settings.sensors.axes, now.others_rate, 0.0
+    axes = settings.sensors.axes
+    rate = now.others_rate
+    total = 0.0
     fill_rate(subset, settings.n, mask, now.corrected, rate)
     for i in range(settings.n):
         now.disagreement[i] = 0.0
@@ -114,7 +117,8 @@ def has_moved(
 
     ``subset`` is that of the others.
     """
-    now, noise = core.now, core.settings.sensors.noise_std[i]
+    now = core.now
+    noise = core.settings.sensors.noise_std[i]
     change = abs(now.prediction[i] - core.reference[i])
     if not (change > least + step and now.disagreement[i] < (AGREED * change) ** 2):
         return False
@@ -129,7 +133,10 @@ def update_stuck(core: Core, subsets: NDArray[Any], mask: int, stamp: int) -> in
 
     ``mask`` has the usable channels without an alarm of their own, which measure motion.
     """
-    n, now, stuck, subset = core.settings.n, core.now, 0, subsets[mask]
+    n = core.settings.n
+    now = core.now
+    stuck = 0
+    subset = subsets[mask]
     # Use uncorrected values: a change of the estimated errors is not motion.
     fill_rate(subset, n, mask, now.input, now.others_rate)
     leave_one_out(core.settings, now, subset)
@@ -172,14 +179,18 @@ def add_stuck(settings: PathSettings, now: Current, evidence: int) -> None:
 @compiled
 def update_repeated(core: Core) -> int:
     """Return the channels of units that repeat all their values while the others move."""
-    members, sensors, found = core.settings.members, core.settings.sensors, 0
+    members = core.settings.members
+    sensors = core.settings.sensors
+    found = 0
     for u in range(core.settings.units):
         # A unit with a missing or out-of-range channel does not count as repeating. A
         # unit with a declared channel may.
-        fresh, moved = members[u] & ~core.now.plain != 0, False
+        fresh = members[u] & ~core.now.plain != 0
+        moved = False
         for i in range(core.settings.n):
             if members[u] >> i & 1:
-                h, change = sensors.axes[i], 0.0
+                h = sensors.axes[i]
+                change = 0.0
                 for a in range(3):
                     change += h[a] * (core.now.rate[a] - core.unit_rate[u, a])
                 fresh = fresh or core.health.run_stamp[i] == core.now.evidence.stamp
@@ -211,12 +222,14 @@ def all_repeat(
     The last bits of a real gyro change even at rest, unless the steps are coarse. Not all
     gyros repeat at once.
     """
-    step, noise = largest_step(settings, health, now), settings.largest_noise
+    step = largest_step(settings, health, now)
+    noise = settings.largest_noise
     # A link with steps of 1 mrad/s may hide noise that is less than expected.
     coarse = step == 0.0 or step > COARSE_STEP * noise or step > COARSE_STEP * AT_REST
     if not now.usable or (coarse and is_at_rest(settings, now)):
         return False
-    fresh, least = 0, max(ALL_REPEAT, settings.stuck_time) if coarse else ALL_REPEAT
+    fresh = 0
+    least = max(ALL_REPEAT, settings.stuck_time) if coarse else ALL_REPEAT
     for i in range(settings.n):
         if stamp - health.run_stamp[i] < least:
             fresh |= 1 << i

@@ -46,19 +46,19 @@ def restamp(
     int
         Mask of the channels with a value.
     """
-    n, units, members, stamp = (
-        settings.n,
-        settings.units,
-        settings.members,
-        sample.stamp,
-    )
+    n = settings.n
+    units = settings.units
+    members = settings.members
+    stamp = sample.stamp
     row = line.rows[line.count % RESTAMP_SAMPLES]
     if line.count > 0:
         step = stamp - line.rows[(line.count - 1) % RESTAMP_SAMPLES].stamp
         line.step = (
             step if line.step == 0 else min(step, line.step + (line.step >> 4) + 1)
         )
-    row.stamp, row.received, row.plain = stamp, received, plain
+    row.stamp = stamp
+    row.received = received
+    row.plain = plain
     line.count += 1
     top = 0.0
     for u in range(units):
@@ -86,16 +86,15 @@ def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: Array)
     oldest = max(line.count - RESTAMP_SAMPLES, 0)
     while k > oldest and line.rows[k % RESTAMP_SAMPLES].stamp > stamp:
         k -= 1
-    before, after = line.rows[k % RESTAMP_SAMPLES], line.rows[(k + 1) % RESTAMP_SAMPLES]
+    before = line.rows[k % RESTAMP_SAMPLES]
+    after = line.rows[(k + 1) % RESTAMP_SAMPLES]
     span = after.stamp - before.stamp
     found = members & before.received & after.received & ~(before.plain ^ after.plain)
     if k + 1 >= line.count or before.stamp > stamp or span > MAX_STEPS * line.step:
         found = 0
     share = (stamp - before.stamp) / max(span, 1)
-    first, last = (
-        line.rows[(k - 1) % RESTAMP_SAMPLES],
-        line.rows[(k + 2) % RESTAMP_SAMPLES],
-    )
+    first = line.rows[(k - 1) % RESTAMP_SAMPLES]
+    last = line.rows[(k + 2) % RESTAMP_SAMPLES]
     curved = 0
     if (
         found
@@ -106,10 +105,8 @@ def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: Array)
         outer = ~(first.plain ^ before.plain) & ~(last.plain ^ before.plain)
         curved = found & first.received & last.received & outer
     # Positions of the outer samples if those of the inner ones are 0 and 1.
-    a, b = (
-        (first.stamp - before.stamp) / max(span, 1),
-        (last.stamp - before.stamp) / max(span, 1),
-    )
+    a = (first.stamp - before.stamp) / max(span, 1)
+    b = (last.stamp - before.stamp) / max(span, 1)
     inside = share * (1.0 - share)
     for i in range(n):
         if members >> i & 1:

@@ -30,12 +30,12 @@ def variance_of(
 def describe_sensors(sensors: Any, geometry: Geometry, noise: NoiseModel) -> None:
     """Fill a record of `Sensors` from noise with one value per channel."""
     n = geometry.n
-    sensors["n"], sensors["constant"] = n, noise.constant
-    sensors["axes"][:n], sensors["gain"][:n] = geometry.axes, geometry.least_squares.T
+    sensors["n"] = n
+    sensors["constant"] = noise.constant
+    sensors["axes"][:n] = geometry.axes
+    sensors["gain"][:n] = geometry.least_squares.T
     for name in ("noise_std", "scale_std", "timing_std"):
         sensors[name][:n] = getattr(noise, name)
-    sensors["share"][:n], sensors["detectable"][:n] = (
-        np.diag(geometry.S),
-        geometry.detectable,
-    )
+    sensors["share"][:n] = np.diag(geometry.S)
+    sensors["detectable"][:n] = geometry.detectable
     sensors["alike"][:n, :n] = geometry.group_matrix

@@ -114,7 +114,8 @@ class Source(ABC):
     @classmethod
     def explain(cls, code: int, data: bytes, count: int) -> str:
         """Return one line on the error of a message that should have ``count`` values."""
-        size, order = len(data), byte_order(data)
+        size = len(data)
+        order = byte_order(data)
         if code == NO_CDR:
             return f"{size} bytes with encapsulation {data[:2].hex() or 'none'} are no plain CDR"
         if code == NO_HEADER:
@@ -227,9 +228,11 @@ class UnitSource(Source):
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
-        imus, count = config.imus, len(config.topics)
+        imus = config.imus
+        count = len(config.topics)
         self.names = self.units = config.imu_names
-        self.timeout, self.max_lag = config.unit_timeout, imus.max_skew
+        self.timeout = config.unit_timeout
+        self.max_lag = imus.max_skew
         self.delays = imus.delays or (0.0,) * count
         self.mounts = list(
             np.reshape(imus.mounts or tuple(np.eye(3).ravel()) * count, (-1, 3, 3))
@@ -252,7 +255,8 @@ class ArraySource(Source):
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
-        self.names, self.timeout = config.topics, config.stale_timeout
+        self.names = config.topics
+        self.timeout = config.stale_timeout
 
     def brought(self, topic: int, n: int, m: int) -> Brought:
         """Return all gyros, or of the second topic all accelerometers."""
@@ -460,7 +464,8 @@ class ChannelsSource(ArraySource):
     @classmethod
     def explain(cls, code: int, data: bytes, count: int) -> str:
         """Explain in one line what is wrong with a message in which count values were expected."""
-        size, order = len(data), byte_order(data)
+        size = len(data)
+        order = byte_order(data)
         if code < FIRST_OWN:
             return super().explain(code, data, count)
         if code == _DIMENSIONS:

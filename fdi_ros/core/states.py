@@ -118,7 +118,8 @@ def update_states(core: Core, checked: int, suspicion: int, learning: bool) -> N
     ``checked`` is the mask of channels whose fault would have been declared.
     """
     for i in range(core.settings.n):
-        bit, shown = 1 << i, _SHOWN[core.health.condition[i]]
+        bit = 1 << i
+        shown = _SHOWN[core.health.condition[i]]
         # Later rules override earlier ones.
         state = OK if checked & bit and not core.now.all_repeat else UNCHECKED
         if suspicion & bit:
@@ -139,7 +140,8 @@ def update_states(core: Core, checked: int, suspicion: int, learning: bool) -> N
 @compiled
 def reason_of(core: Core, subset: Subset, i: int) -> int:
     """Return the reason of a channel's state. ``subset`` is that of the living channels."""
-    state, condition = core.last.state[i], core.health.condition[i]
+    state = core.last.state[i]
+    condition = core.health.condition[i]
     if state in (OK, EXCLUDED):
         return _NONE if state == OK else _OPERATOR
     if state == FAULTY:
@@ -181,7 +183,8 @@ def write_events(
     last = core.last
     core.group = core.decision.ambiguous
     for i in range(core.settings.n):
-        after, reason = last.state[i], reason_of(core, subset, i)
+        after = last.state[i]
+        reason = reason_of(core, subset, i)
         core.reason[i] = reason
         if after != core.state[i]:
             error = 0.0
@@ -199,11 +202,17 @@ def write_events(
                     error = 0.0
             event = events[count]
             first = core.settings.first
-            event.row, event.stamp, event.channel = row, last.stamp, first + i
+            event.row = row
+            event.stamp = last.stamp
+            event.channel = first + i
             event.error = core.settings.natural * error
-            event.before, event.after, event.reason = core.state[i], after, reason
+            event.before = core.state[i]
+            event.after = after
+            event.reason = reason
             group = core.decision.ambiguous if after == AMBIGUOUS else 1 << i
             event.group = group << first
-            core.state[i], core.since[i], core.error[i] = after, last.stamp, error
+            core.state[i] = after
+            core.since[i] = last.stamp
+            core.error[i] = error
             count += 1
     return count

@@ -78,12 +78,11 @@ def prepare_subsets(geometry: Geometry, noise: NoiseModel) -> NDArray[Any]:
     bits = all_sets(n)
     used = bits[:, :, None] * geometry.axes
     singular = np.linalg.svd(used, compute_uv=False)
-    worst, best = singular[:, -1], singular[:, 0]
+    worst = singular[:, -1]
+    best = singular[:, 0]
     spans = (bits.sum(axis=1) >= 3) & (worst >= MIN_SINGULAR_RATIO * best)
-    subsets["spans"], subsets["spare"] = (
-        spans,
-        spans & (worst >= MIN_SPARE_RATIO * best),
-    )
+    subsets["spans"] = spans
+    subsets["spare"] = spans & (worst >= MIN_SPARE_RATIO * best)
     roots = bits[spans] / noise.noise_std
     gain = (
         np.linalg.pinv(roots[:, :, None] * geometry.axes).transpose(0, 2, 1)
@@ -107,7 +106,8 @@ def prepare_capability(
     count = bits.sum(axis=1)
     enough = (subsets["spans"] != 0) & (count >= MIN_CHANNELS)
     runs = enough & np.array(can_run)[count]
-    subsets["refused"], subsets["detectable"] = enough & ~runs, 0
+    subsets["refused"] = enough & ~runs
+    subsets["detectable"] = 0
     gain = np.linalg.pinv(bits[runs][:, :, None] * geometry.axes).transpose(0, 2, 1)
     share = 1 - np.einsum("kij,ij->ki", gain, geometry.axes)
     seen = bits[runs] & (np.sqrt(np.clip(share, 0, None)) >= MIN_SENSITIVITY)

@@ -245,19 +245,17 @@ class _Rows:
         self._masks = [whole_set(n)]
         self._oldest = 1
         bank = self.bank[0]
-        bank["n"], bank["judge"], bank["rows"] = n, detector.judge.address, 1
+        bank["n"] = n
+        bank["judge"] = detector.judge.address
+        bank["rows"] = 1
         bank["constants"], bank["states"] = (
             address_of(self.constants),
             address_of(self.states),
         )
-        bank["constants_size"], bank["states_size"] = (
-            self.constants.itemsize,
-            self.states.itemsize,
-        )
-        bank["takes_any"], bank["period"] = (
-            detector.takes_any,
-            round(1e9 / detector.sample_rate),
-        )
+        bank["constants_size"] = self.constants.itemsize
+        bank["states_size"] = self.states.itemsize
+        bank["takes_any"] = detector.takes_any
+        bank["period"] = round(1e9 / detector.sample_rate)
         bank["row"] = UNPREPARED
         bank["row"][self._masks[0]] = 0
         self.constants[0] = detector.constants[0]
@@ -272,10 +270,8 @@ class _Rows:
             self._masks.append(mask)
             self.bank["rows"] = row + 1
         else:
-            row, self._oldest = (
-                self._oldest,
-                self._oldest % (len(self.constants) - 1) + 1,
-            )
+            row = self._oldest
+            self._oldest = self._oldest % (len(self.constants) - 1) + 1
             self.bank["row"][0, self._masks[row]] = UNPREPARED
             self._masks[row] = mask
         self.constants[row] = detector.constants[0]
@@ -297,7 +293,8 @@ def judge_rows(
     Return the first row whose set of channels is not prepared, or N at the end.
     """
     for k in range(start, len(z)):
-        sample[0].mask, sample[0].stamp = present_in(z[k], bank[0].n), bank[0].clock
+        sample[0].mask = present_in(z[k], bank[0].n)
+        sample[0].stamp = bank[0].clock
         bank[0].clock += bank[0].period
         for a in range(3):
             sample[0].acceleration[a] = acceleration[

@@ -246,7 +246,8 @@ class CommonRate(TrialProtocol[Cell]):
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Find by method the ratios of healthy samples that can decide a threshold."""
-        z, alarms = self.draw(cell, count, rng)[0], self.settings["false_alarms"]
+        z = self.draw(cell, count, rng)[0]
+        alarms = self.settings["false_alarms"]
         # Twice the share of alarms, and more.
         kept = int(2 * max(alarms) * len(z)) + 50
         running = self.contenders[cell.geometry].running
@@ -286,7 +287,9 @@ class CommonRate(TrialProtocol[Cell]):
     ) -> Contenders:
         """Build methods of `METHODS` at loose thresholds. Options in ``own`` take precedence."""
         geometry, (noise, probability) = self.geometries[g], self.loose()
-        running, refused, streaming = {}, {}, {}
+        running = {}
+        refused = {}
+        streaming = {}
         for name in names:
             accepted = accepted_options(METHODS[name])
             options = dict(
@@ -372,7 +375,8 @@ def cusum_run_length(limit: float, reference: float, mean: float) -> float:
     # The kernel is one standard deviation wide: a few nodes in each.
     nodes = 60 + math.ceil(2 * limit)
     node, weight = np.polynomial.legendre.leggauss(nodes)
-    at, weight = limit * (node + 1) / 2, limit * weight / 2
+    at = limit * (node + 1) / 2
+    weight = limit * weight / 2
     start = np.concatenate([[0.0], at])
     step = at - start[:, None] + reference - mean
     matrix = np.zeros((nodes + 1, nodes + 1))

@@ -232,7 +232,8 @@ class Flight(TrialProtocol[str]):
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)
-        rest, duration = self.settings["rest"], self.settings["duration"]
+        rest = self.settings["rest"]
+        duration = self.settings["duration"]
         if duration < 2 * rest + 1:
             raise StudyError(
                 f"flight.duration is {duration:g} s, expected at least 2 flight.rest + 1 s: {2 * rest + 1:g} s"
@@ -306,7 +307,8 @@ class Flight(TrialProtocol[str]):
         block = GyroErrors().draw(self._geometry, rng).measure(motion, stamp, rng)
         channel = int(rng.integers(self._geometry.n))
         onset = float(rng.uniform(settings["rest"] + 0.5, settings["duration"] / 2))
-        seed, sign = int(rng.integers(2**31)), float(rng.choice([-1.0, 1.0]))
+        seed = int(rng.integers(2**31))
+        sign = float(rng.choice([-1.0, 1.0]))
         truth = motion.rate_at((stamp - stamp[0]) * 1e-9)
         if kind == NONE:
             return Flown(

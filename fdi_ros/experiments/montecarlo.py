@@ -375,7 +375,8 @@ def run_study(
     prepared = [
         protocol.conclude(own) for protocol, own in zip(protocols, found, strict=True)
     ]
-    sections, trials = [], run(TRIALS, prepared)
+    sections = []
+    trials = run(TRIALS, prepared)
     for one, protocol, preparation, counts in zip(
         study.sections, protocols, prepared, trials, strict=True
     ):

@@ -210,7 +210,8 @@ def _snapshot(group: Group) -> list[Section]:
         ]
     healthy, *faults = group.cells
     columns: list[ByDetector] = [("healthy", _at(healthy), _of("declared"))]
-    right, declared = _of("right"), _of("declared")
+    right = _of("right")
+    declared = _of("declared")
     columns += [
         (f"{cell['size']:g}", _at(cell), lambda at: f"{right(at)} ({declared(at)})")
         for cell in faults
@@ -253,7 +254,8 @@ def _double(group: Group, cell: Figures) -> Section:
 
 
 def _snapshot_curves(group: Group) -> list[Section]:
-    alarms, faults = group.settings["false_alarms"], group.faults
+    alarms = group.settings["false_alarms"]
+    faults = group.faults
     if group.settings["faults"] != 1:
         return []
     if len(alarms) == 1:
@@ -333,7 +335,8 @@ def _delay_curves(group: Group) -> list[Section]:
 
 def _flight(group: Group) -> list[Section]:
     def delays(at: Figures) -> str:
-        median, late = at["delay_s"]["p50"], at["delay_s"]["p90"]
+        median = at["delay_s"]["p50"]
+        late = at["delay_s"]["p90"]
         return "-" if median is None else f"{median:.2f} / {late:.2f}"
 
     def rms(at: Figures) -> str:
@@ -359,7 +362,8 @@ def _flight(group: Group) -> list[Section]:
 
 def _search(group: Group) -> list[Section]:
     """Return shares by selection: of the paper's searches, then of all methods by rate."""
-    found, settings = [], group.settings
+    found = []
+    settings = group.settings
     for cell in group.cells:
         rows = [
             (name, "tolerance (8)", shares)

@@ -86,7 +86,8 @@ class ResidualSearch(CommonRate):
     ) -> Counts:
         """Draw trials of the protocol and evaluate every method on them."""
         z, failed = self.draw(cell, count, rng)
-        methods, paper = {}, {}
+        methods = {}
+        paper = {}
         for name, contender in self.contenders[0].running.items():
             evaluation = contender.evaluate(z)
             factors = preparation["factors"][name]
@@ -101,7 +102,8 @@ class ResidualSearch(CommonRate):
 
     def summary(self, cell: Cell, counts: Counts, preparation: Preparation) -> Figures:
         """Return shares of the trials that the selection keeps by outcome."""
-        alarms, kept = self.settings["false_alarms"], counts["kept"]
+        alarms = self.settings["false_alarms"]
+        kept = counts["kept"]
 
         def shares(outcomes: Counts) -> Figures:
             return {name: share(count, kept) for name, count in outcomes.items()}
@@ -124,7 +126,8 @@ class ResidualSearch(CommonRate):
 
     def loose(self) -> tuple[NoiseModel, float]:
         """Errors of the protocol, and thresholds at which methods name a channel nearly always."""
-        zero, scale = self._zero_std, self.settings["scale_std"]
+        zero = self._zero_std
+        scale = self.settings["scale_std"]
         return NoiseModel(
             zero, scale, bound=BOUND * (zero + scale * self.settings["max_rate"])
         ), LOOSE_FALSE_ALARM
@@ -174,7 +177,8 @@ def _selected(size: Array, failed: Index, selection: str) -> NDArray[np.bool_]:
     healthy = np.ones(size.shape, dtype=bool)
     healthy[rows, failed] = False
     others = size[healthy].reshape(len(size), -1)
-    middle, spread = others.mean(axis=1), others.std(axis=1)
+    middle = others.mean(axis=1)
+    spread = others.std(axis=1)
     inside: NDArray[np.bool_] = (middle - 3 * spread < own) & (
         own < middle + 3 * spread
     )

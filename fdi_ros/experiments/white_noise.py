@@ -143,7 +143,8 @@ class Snapshot(CommonRate):
         self, cell: Cell, count: int, rng: np.random.Generator
     ) -> tuple[Array, Mask]:
         """Draw samples z (N, n) rad/s, and which channels are struck (N, n)."""
-        geometry, sigma = self.geometries[cell.geometry], self.settings["noise_std"]
+        geometry = self.geometries[cell.geometry]
+        sigma = self.settings["noise_std"]
         rate = rng.uniform(-1, 1, (count, 3)) * self.settings["max_rate"]
         z = rate @ geometry.axes.T + sigma * rng.standard_normal((count, geometry.n))
         struck = np.zeros(z.shape, dtype=bool)
@@ -195,7 +196,8 @@ def counted(evaluation: Evaluation, factor: float, struck: Mask) -> Counts:
 
 def _shares(false_alarm: float, counts: Counts) -> Figures:
     """Return shares of the samples at one rate, without those the method has not."""
-    trials, identified = counts["trials"], counts["identified"]
+    trials = counts["trials"]
+    identified = counts["identified"]
     wrong = counts["isolated"] - counts["isolated_right"]
     return {
         "false_alarm": false_alarm,
@@ -252,10 +254,8 @@ class Delay(CommonRate):
 
     def prepare(self, cell: Cell, count: int, rng: np.random.Generator) -> Counts:
         """Find the largest ratio of every window of healthy samples."""
-        z, running = (
-            self.draw(cell, count, rng)[0],
-            self.contenders[cell.geometry].running,
-        )
+        z = self.draw(cell, count, rng)[0]
+        running = self.contenders[cell.geometry].running
         return {
             "trials": count,
             "largest": {
@@ -280,7 +280,8 @@ class Delay(CommonRate):
     ) -> Counts:
         """Draw streams and run every method on them."""
         z, _ = self.draw(cell, count, rng)
-        lead, factors = self.settings["lead"], preparation["factors"][cell.geometry]
+        lead = self.settings["lead"]
+        factors = preparation["factors"][cell.geometry]
         running = self.contenders[cell.geometry].running
         methods = {
             name: _delays(_ratios(one, z) >= factors[name], lead)
@@ -312,15 +313,14 @@ class Delay(CommonRate):
         self, cell: Cell, count: int, rng: np.random.Generator
     ) -> tuple[Array, None]:
         """Draw streams (count, length, n), rad/s, healthy or with a fault after the lead."""
-        n, lead, sigma = (
-            self.geometries[cell.geometry].n,
-            self.settings["lead"],
-            self.settings["noise_std"],
-        )
+        n = self.geometries[cell.geometry].n
+        lead = self.settings["lead"]
+        sigma = self.settings["noise_std"]
         length = self._window if cell.healthy else lead + self.settings["longest"]
         z = sigma * rng.standard_normal((count, length, n))
         if not cell.healthy:
-            channel, sign = rng.integers(n, size=count), rng.choice([-1.0, 1.0], count)
+            channel = rng.integers(n, size=count)
+            sign = rng.choice([-1.0, 1.0], count)
             z[np.arange(count), lead:, channel] += (cell.size * sigma * sign)[:, None]
         return z, None
 
@@ -369,9 +369,12 @@ def _waited(counts: Counts, memory: bool) -> Figures:
 
     None: not known, as some streams ended before the alarm.
     """
-    heard, unheard, delay = counts["heard"], counts["unheard"], None
+    heard = counts["heard"]
+    unheard = counts["unheard"]
+    delay = None
     if not memory and heard:
-        half, mean = Z95 / math.sqrt(heard), counts["waited"] / heard
+        half = Z95 / math.sqrt(heard)
+        mean = counts["waited"] / heard
         delay = Estimate(mean, mean * math.exp(-half), mean * math.exp(half))
     elif memory and not unheard:
         delay = mean_of(float(counts["waited"]), float(counts["squares"]), heard)

@@ -136,10 +136,8 @@ def create_kind(name: str, /, **options: float | str | None) -> FaultKind:
         raise FaultError(
             f"unknown fault kind {name!r}, {did_you_mean(name, tuple(FAULT_KINDS))}"
         )
-    kind, given = (
-        FAULT_KINDS[name],
-        {option: value for option, value in options.items() if value is not None},
-    )
+    kind = FAULT_KINDS[name]
+    given = {option: value for option, value in options.items() if value is not None}
     taken = kind.options()
     for option in given:
         if option not in taken:
@@ -271,7 +269,8 @@ class Injector:
             return block
         if self.start_stamp is None:
             self.start_stamp = int(block.stamp[0])
-        time, active = self.time(block.stamp), self.active(block.stamp)
+        time = self.time(block.stamp)
+        active = self.active(block.stamp)
         z = np.hstack([half.z for half in block.halves])
         received = np.hstack([half.delivered for half in block.halves])
         for k, fault in enumerate(self.faults):
@@ -282,7 +281,8 @@ class Injector:
             # Both the recorded value and the added one may be infinite.
             with np.errstate(invalid="ignore", over="ignore"):
                 fault.kind.strike(struck, self._memories[k], self._random[k])
-            z[:, index], received[:, index] = struck.z, struck.received
+            z[:, index] = struck.z
+            received[:, index] = struck.received
         n = block.z.shape[1]
         all_came = block.received is None and received[:, :n].all()
         faulty = Block(block.stamp, z[:, :n], None if all_came else received[:, :n])

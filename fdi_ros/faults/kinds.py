@@ -172,7 +172,8 @@ class Stuck(FaultKind):
         self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
     ) -> None:
         """Hold the given value, or the last finite one before the start."""
-        active, z = samples.active, samples.z
+        active = samples.active
+        z = samples.z
         first = int(np.argmax(active)) if active.any() else len(active)
         last = memory.setdefault("last", z[0].copy())
         for column, values in enumerate(z[:first].T):
@@ -245,7 +246,8 @@ class Spike(FaultKind):
         self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
     ) -> None:
         """Strike a sample with probability 1 - exp(-rate dt) for an interval dt."""
-        time, active = samples.time, samples.active
+        time = samples.time
+        active = samples.active
         before = memory.get("last", time[0])
         probability = -np.expm1(-self.rate * np.diff(time, prepend=before)[active])[
             :, None

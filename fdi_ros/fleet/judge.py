@@ -92,7 +92,8 @@ def _below(folder: Path, unread: list[str]) -> Iterator[Path]:
         unread.append(f"cannot read {error.filename}: {error.strerror}")
 
     for place, folders, files in os.walk(folder, onerror=note, followlinks=True):
-        here, real = Path(place), os.path.realpath(place)
+        here = Path(place)
+        real = os.path.realpath(place)
         if real in walked:
             folders.clear()
             continue
@@ -111,7 +112,8 @@ def _below(folder: Path, unread: list[str]) -> Iterator[Path]:
 
 def _is_recording(path: Path, unread: list[str]) -> bool:
     """Whether a file is a recording. A file that is only named like one is added to ``unread``."""
-    name, suffix = path.name.lower(), path.suffix.lower()
+    name = path.name.lower()
+    suffix = path.suffix.lower()
     if not name.endswith((*SUFFIXES, *LOG_SUFFIXES)) or not path.is_file():
         return False
     if not name.endswith(LOG_SUFFIXES):
@@ -259,17 +261,17 @@ def _judged(
     calibrated: bool,
     reports: Path | None,
 ) -> Judged:
-    text, flight = parameters, replace(flight, measured=bool(parameters))
+    text = parameters
+    flight = replace(flight, measured=bool(parameters))
     unused: tuple[tuple[str, str], ...] = ()
     if not parameters:
         start = starting_config_of(path, "no config")
-        text, unused = start.text, start.unused
+        text = start.text
+        unused = start.unused
     if calibrated:
         try:
-            text, flight = (
-                _calibrated(path, text),
-                replace(flight, calibration="on itself", measured=True),
-            )
+            text = _calibrated(path, text)
+            flight = replace(flight, calibration="on itself", measured=True)
         except FdiError as error:
             flight = replace(flight, calibration=storable(f"refused: {error}"))
     config = Config.from_parameters(parameters_of(text))
@@ -337,7 +339,9 @@ class _Seen(Sink):
 
 def _row(known: Flight, summary: Summary) -> Flight:
     """Return the row of a judged recording."""
-    monitor, stream, declared = summary.monitor, summary.stream, summary.story.declared
+    monitor = summary.monitor
+    stream = summary.stream
+    declared = summary.story.declared
     # A declared channel that was silent for a while is declared once.
     steps = [step for one in declared for step in one.steps]
     found = summary.verdict

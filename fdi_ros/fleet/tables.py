@@ -173,10 +173,8 @@ class Tables:
                 f"cannot write to {folder}: {error.strerror or error}"
             ) from error
         try:
-            flights, episodes = (
-                self._read("flights", force),
-                self._read("episodes", force),
-            )
+            flights = self._read("flights", force)
+            episodes = self._read("episodes", force)
         except (BagError, OSError):
             self.give_up()
             raise
@@ -185,7 +183,8 @@ class Tables:
         for row in episodes:
             # Episodes without a flight are dropped, because the flight is judged again.
             self._episodes.get(row["path"], []).append(row)
-        self._written, self._took = time.monotonic(), 0.0
+        self._written = time.monotonic()
+        self._took = 0.0
 
     def give_up(self) -> None:
         """Remove the files of a refused run. A folder with other content stays."""
@@ -207,7 +206,8 @@ class Tables:
 
     def write(self) -> None:
         """Write the tables, sorted by path. Episodes come first, so that no flight lacks its own."""
-        begun, paths = time.monotonic(), sorted(self.flights)
+        begun = time.monotonic()
+        paths = sorted(self.flights)
         self._save(
             "episodes",
             FlightEpisode,
@@ -301,7 +301,8 @@ class Fleet:
 
     def __init__(self, flights: Sequence[Row]) -> None:
         def rank(row: Row) -> tuple[int, int, bool, str]:
-            declared, sets = row["declared"] or 0, row["sets"] or 0
+            declared = row["declared"] or 0
+            sets = row["sets"] or 0
             return sets - declared, -declared, not row["error"], row["path"]
 
         self.flights = sorted(flights, key=rank)
@@ -347,7 +348,8 @@ class Fleet:
 
     def lines(self) -> list[str]:
         """Return the result in sentences, the verdict first."""
-        own, declaring = self.figures(), sum(row["declared"] > 0 for row in self.judged)
+        own = self.figures()
+        declaring = sum(row["declared"] > 0 for row in self.judged)
         counts = (
             f"{_count(own['vehicles'], 'vehicle')}; {_count(own['not_judged'], 'flight')} could not be judged;"
             f" {_count(own['episodes'], 'fault')} declared, in {_count(declaring, 'flight')};"

@@ -159,7 +159,8 @@ def not_configured(bag: Path, config: Config) -> list[str]:
 
 def _unusable(report: TopicReport) -> str:
     """Return why a topic cannot serve as gyros, empty if it can."""
-    kind, received = report.kind, report.received
+    kind = report.kind
+    received = report.received
     if kind is None:
         return "its type carries no gyros"
     # The first that holds is the reason.
@@ -209,7 +210,8 @@ def recording_findings(
     ``refused``: reason why no config can be made, where the recording needs nothing.
     """
     chosen = candidates(reports)
-    lacking, clocks = needs(reports) or refused, one_clock(chosen)
+    lacking = needs(reports) or refused
+    clocks = one_clock(chosen)
     if lacking or clocks:
         words = lacking or f"one clock: {clocks}"
         yield Finding(Role.WARNING, "needs", words, headline="NEEDS")

@@ -28,7 +28,8 @@ def run_lengths(values: Array) -> NDArray[np.int64]:
 
 def repeated(z: Array, step: float) -> Mask:
     """Mark samples of z (N, n), every `step` s, in a long run of one value of a channel."""
-    found, least = np.zeros(z.shape, dtype=bool), least_run(step)
+    found = np.zeros(z.shape, dtype=bool)
+    least = least_run(step)
     for k, values in enumerate(z.T):
         lengths = run_lengths(values)
         long = np.repeat(lengths >= least, lengths)
@@ -56,11 +57,13 @@ class Repeats:
         """Take the next values (N, c), every `step` s, 0 if the rate is not known yet."""
         least = least_run(step)
         for k, column in enumerate(values.T if len(values) else ()):
-            lengths, before = run_lengths(column), 0
+            lengths = run_lengths(column)
+            before = 0
             if column[0] == self._last[k]:
                 before = int(self._run[k])
                 lengths[0] += before
             self.count[k] += lengths[lengths >= least].sum() - (
                 before if before >= least else 0
             )
-            self._last[k], self._run[k] = column[-1], lengths[-1]
+            self._last[k] = column[-1]
+            self._run[k] = lengths[-1]

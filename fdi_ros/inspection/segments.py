@@ -62,20 +62,16 @@ class NoiseSegments:
         self._kept: list[NoiseSegment] = []
         self._passed = 0
         # Values (K, c) that do not make a segment yet, and their times, ns.
-        self._waiting, self._times = (
-            np.empty((0, channels)),
-            np.empty(0, dtype=np.int64),
-        )
+        self._waiting = np.empty((0, channels))
+        self._times = np.empty(0, dtype=np.int64)
 
     def add(self, values: Array, times: Int, rate: float) -> None:
         """Take finite values (K, c), rad/s, at times (K,), ns.
 
         ``rate``: sample rate, Hz; 0 if not known yet.
         """
-        values, times = (
-            np.vstack([self._waiting, values]),
-            np.concatenate([self._times, times]),
-        )
+        values = np.vstack([self._waiting, values])
+        times = np.concatenate([self._times, times])
         size = (
             REST_BLOCKS * max(round(LENGTH * rate / REST_BLOCKS), 1)
             if rate
@@ -87,8 +83,10 @@ class NoiseSegments:
                 self._kept.append(_segment(values[k : k + size], int(times[k])))
             self._passed += 1
             if len(self._kept) > MOST:
-                self._kept, self.every = self._kept[::2], 2 * self.every
-        self._waiting, self._times = values[full:], times[full:]
+                self._kept = self._kept[::2]
+                self.every = 2 * self.every
+        self._waiting = values[full:]
+        self._times = times[full:]
 
     @property
     def empty(self) -> bool:
@@ -111,7 +109,8 @@ class NoiseSegments:
 
     def noise(self, largest_bias: float = LARGEST_BIAS) -> Noise:
         """Work out the noise of all so far, of gyros with biases of so much, rad/s."""
-        segments, unknown = self.all_segments(), np.full(self.channels, np.nan)
+        segments = self.all_segments()
+        unknown = np.full(self.channels, np.nan)
         if not segments:
             return Noise(unknown, unknown, [])
         least, block = _least_noise(segments)
@@ -158,10 +157,8 @@ class Noise(NamedTuple):
 
 def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
     """Noise (c,) of a sample and of a block when quietest, rad/s."""
-    noise, block = (
-        np.array([one.noise for one in segments]),
-        np.array([one.block_noise for one in segments]),
-    )
+    noise = np.array([one.noise for one in segments])
+    block = np.array([one.block_noise for one in segments])
     # A unit with repeated values shows no noise; its usual noise stands in.
     for column in (*noise.T, *block.T):
         if column.any():
@@ -180,7 +177,8 @@ def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
 
 def _segment(values: Array, first: int) -> NoiseSegment:
     means = values.reshape(REST_BLOCKS, -1, values.shape[1]).mean(axis=1)
-    least, std = _noise(means), values.std(axis=0)
+    least = _noise(means)
+    std = values.std(axis=0)
     return NoiseSegment(
         first,
         means,
@@ -191,10 +189,8 @@ def _segment(values: Array, first: int) -> NoiseSegment:
 
 
 def _noise(values: Array) -> Array:
-    inside, smooth = (
-        len(SMOOTH) // 2,
-        np.column_stack([np.convolve(v, SMOOTH, mode="valid") for v in values.T]),
-    )
+    inside = len(SMOOTH) // 2
+    smooth = np.column_stack([np.convolve(v, SMOOTH, mode="valid") for v in values.T])
     # The parabola absorbs a share of white noise.
     noise = np.sqrt(
         np.mean((values[inside:-inside] - smooth) ** 2, axis=0) / (1.0 - SMOOTH[inside])

@@ -125,7 +125,8 @@ def assumed_config(path: Path) -> AssumedConfig:
         raise BagError(
             f"{refused}: {turned}. `fdi setup` measures the mounts and writes a config for --config"
         )
-    low, high = min(config.noise.noise_std), max(config.noise.noise_std)
+    low = min(config.noise.noise_std)
+    high = max(config.noise.noise_std)
     copies = f"{found.look}; " if found.look else ""
     words = (
         f"{copies}{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz,"
@@ -137,7 +138,8 @@ def assumed_config(path: Path) -> AssumedConfig:
 
 def _turned_units(path: Path, config: Config) -> str:
     """Name the units that measure the motion of the first one along other axes, may be empty."""
-    size, names = max(1, round(WINDOW * config.sample_rate)), config.imus.names
+    size = max(1, round(WINDOW * config.sample_rate))
+    names = config.imus.names
     with Recording(path) as recording:
         means = [
             block.z[: len(block) // size * size]
@@ -168,10 +170,8 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
     """Make a config to start from, of the topics of gyros in a recording."""
     kind = chosen[0].kind
     assert kind is not None
-    rate, largest = (
-        max(report.rate for report in chosen),
-        max(report.largest for report in chosen),
-    )
+    rate = max(report.rate for report in chosen)
+    largest = max(report.largest for report in chosen)
     at_rest = rate * _REST >= MIN_LEARNED and all(map(_starts_at_rest, chosen))
     largest_rate = _rounded_up(
         max(*PARAMETERS["health.max_rate"].default, 1.001 * largest)
@@ -213,10 +213,8 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
             words = "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
             known["decision.latch"] = False, words
         if timeout := _longer(chosen, _BRIDGED, 10.0):
-            slowest, none = (
-                min(report.rate for report in chosen),
-                "none would be aligned between two",
-            )
+            slowest = min(report.rate for report in chosen)
+            none = "none would be aligned between two"
             words = f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s {none}"
             known["imus.timeout"] = timeout, words
     else:
@@ -224,10 +222,8 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
             "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns about all axes,"
             " but for those of three reference channels: these must be right"
         )
-        known["channels.topic"], known["geometry.preset"] = (
-            (topics[0], ""),
-            ("cone", words),
-        )
+        known["channels.topic"] = (topics[0], "")
+        known["geometry.preset"] = ("cone", words)
         known["geometry.cone_channels"] = chosen[0].channels, ""
     if silent := _longer(chosen, GAP, 60.0):
         known["health.stale_timeout"] = silent, f"the default is {_TIMEOUT:g} s"
@@ -245,10 +241,8 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
     A mostly moving recording gives the noise in motion.
     """
     noise = [report.segments.noise() for report in chosen]
-    share, levels = (
-        min(one.share for one in noise),
-        np.concatenate([one.moving for one in noise]),
-    )
+    share = min(one.share for one in noise)
+    levels = np.concatenate([one.moving for one in noise])
     words = f"in motion ({share:.0%} of the recording), vibration included"
     if not (share > 0.5 and np.isfinite(levels).all() and (levels > 0).all()):
         quiet = np.concatenate([one.quiet for one in noise])

@@ -176,7 +176,8 @@ def inspect(
 def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     times = batch.log_time[rows]
     _take_times(report, times)
-    kind, messages = report.kind, (batch.buffer, batch.offset[rows], batch.length[rows])
+    kind = report.kind
+    messages = (batch.buffer, batch.offset[rows], batch.length[rows])
     if kind is None or report.topic.encoding != "cdr":
         return
     if not report.channels:
@@ -187,13 +188,16 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     decoded = kind.decode(*messages, report.channels)
     good = decoded.good
     report.malformed += int((~good).sum())
-    stamp, values, times = decoded.stamp[good], decoded.values[good], times[good]
+    stamp = decoded.stamp[good]
+    values = decoded.values[good]
+    times = times[good]
     if kind.stamped:
         _take_stamps(report, stamp)
         if math.isnan(report.ahead) and len(stamp):
             report.ahead = float(np.median((stamp - times) * 1e-9))
     with np.errstate(invalid="ignore"):
-        finite, believed = np.isfinite(values), np.abs(values) < BELIEVED
+        finite = np.isfinite(values)
+        believed = np.abs(values) < BELIEVED
     report.repeats.add(values, report.interval)
     report.not_finite += (~finite).sum(axis=0)
     report.beyond += (finite & ~believed).sum(axis=0)

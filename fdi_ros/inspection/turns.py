@@ -37,7 +37,8 @@ def find_turn(first: Array, unit: Array) -> tuple[Array, Array, float]:
     """
     left, size, right = np.linalg.svd(first.T @ unit)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation, mirrored = (left * sign) @ right, (left * sign * [1.0, 1.0, -1.0]) @ right
+    rotation = (left * sign) @ right
+    mirrored = (left * sign * [1.0, 1.0, -1.0]) @ right
     if size[1] <= ROUNDING * size[0]:
         return rotation, mirrored, math.inf
     a, b, c = size * sign

@@ -53,7 +53,8 @@ class Link:
         self.trouble = "not open yet"  #: Why the link is not open. Empty: open.
         self.dropped = 0  #: Messages that could not be sent.
         self.opened = 0  #: Number of times that the link was opened.
-        self._make, self._gone = make, gone
+        self._make = make
+        self._gone = gone
         self._attempt = 0
         self._handle: Any = None  # non-blocking socket or serial port
         self._waiting = bytearray()
@@ -84,10 +85,12 @@ class Link:
             if self._handle is None:
                 if now < self._attempt:
                     return []
-                self._attempt, self.trouble = now + RETRY, "connecting"
+                self._attempt = now + RETRY
+                self.trouble = "connecting"
                 self._handle = self._make()
             if self.trouble and self._is_connected():
-                self.trouble, self.opened = "", self.opened + 1
+                self.trouble = ""
+                self.opened = self.opened + 1
             while not self.trouble and size < MOST_AT_ONCE:
                 found.append(self._read())
                 size += len(found[-1][1])

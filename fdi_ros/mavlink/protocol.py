@@ -121,7 +121,8 @@ def read(number: int, payload: bytes) -> ImuSample | None:
         if updated & GYRO_UPDATED != GYRO_UPDATED:
             return None
     ax, ay, az, gx, gy, gz = values
-    a, g = message.acceleration, message.gyro
+    a = message.acceleration
+    g = message.gyro
     unit = message.unit if message.unit_at < 0 else data[message.unit_at]
     stamp = 1000 * message.microseconds * time
     return ImuSample(
@@ -208,7 +209,8 @@ class Streams:
             if wanted.tries and now < wanted.asked + PATIENCE:
                 return None
             if wanted.tries < TRIES:
-                wanted.asked, wanted.tries = now, wanted.tries + 1
+                wanted.asked = now
+                wanted.tries = wanted.tries + 1
                 return self._queue[0], wanted.interval
             wanted.answer = "no answer"
             del self._queue[0]
@@ -296,7 +298,8 @@ class TimeSync:
         trip = now - sent
         if not 0 <= trip <= LONGEST:
             return False
-        offset, half = remote - (sent + trip // 2), trip // 2
+        offset = remote - (sent + trip // 2)
+        half = trip // 2
         far = [
             abs(offset - other) > half + less + DRIFT * (now - at) + GRAIN
             for at, other, less in self._trips
@@ -321,7 +324,8 @@ class TimeSync:
             if self._arrival is None
             else self._arrival - DRIFT * (now - self._arrival_at)
         )
-        self._arrival, self._arrival_at = max(float(remote - now), known), now
+        self._arrival = max(float(remote - now), known)
+        self._arrival_at = now
 
     @property
     def synchronised(self) -> bool:
@@ -345,7 +349,8 @@ class TimeSync:
         if used is not None and abs(wanted - used) <= STEP:
             most = SLEW * max(0, now - self._used_at)
             wanted = used + min(max(wanted - used, -most), most)
-        self._used, self._used_at = wanted, now
+        self._used = wanted
+        self._used_at = now
         return round(wanted)
 
 
@@ -395,7 +400,8 @@ class BootClock:
         )
         if latest - self.BACK <= time <= now + lead + self.AHEAD:
             self._odd = 0
-            self._latest, self._lead = max(latest, time), max(lead, time - now)
+            self._latest = max(latest, time)
+            self._lead = max(lead, time - now)
             return time
         self._odd += 1
         if self._odd >= SURE:

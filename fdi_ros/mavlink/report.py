@@ -54,7 +54,8 @@ class Reporter:
         ]
 
     def _format_link(self, recent: dict[str, int], now: int) -> tuple[Level, str]:
-        vehicle, link = self._vehicle, self._link
+        vehicle = self._vehicle
+        link = self._link
         if link.trouble:
             return Level.ERROR, f"{link.url}: {link.trouble}"
         if not vehicle.heard:
@@ -85,7 +86,8 @@ class Reporter:
             words.append(
                 "no answer to TIMESYNC: stamps are late by the unknown latency of the link"
             )
-        lost, heard = recent.get("lost", 0), recent.get("messages", 0)
+        lost = recent.get("lost", 0)
+        heard = recent.get("messages", 0)
         if lost > LOSSY * (lost + heard):
             words.append(f"{lost} of {lost + heard} messages lost")
         if more := [
@@ -102,7 +104,8 @@ class Reporter:
         return (Level.WARN if words else Level.OK), "; ".join([who, *words])
 
     def _link_values(self, now: int) -> tuple[tuple[str, str], ...]:
-        vehicle, link = self._vehicle, self._link
+        vehicle = self._vehicle
+        link = self._link
         error = vehicle.sync.error(now)
         offset = vehicle.sync.offset(now)
         counts = (
@@ -144,10 +147,8 @@ class Reporter:
 
     def _format_unit(self, unit: int, now: int) -> tuple[Level, str]:
         vehicle = self._vehicle
-        track, answer = (
-            vehicle.units.get(unit),
-            vehicle.streams.answer_to(self._message(unit)),
-        )
+        track = vehicle.units.get(unit)
+        answer = vehicle.streams.answer_to(self._message(unit))
         if track is None and unit in vehicle.magnetometers:
             return (
                 Level.ERROR,
@@ -157,7 +158,8 @@ class Reporter:
             return (
                 Level.ERROR if vehicle.in_reach else Level.STALE
             ), f"nothing of this unit yet; request: {answer}"
-        rate, asked = track.rate(now), vehicle.settings.rate
+        rate = track.rate(now)
+        asked = vehicle.settings.rate
         if not rate:
             return Level.STALE, f"silent for {(now - track.last) / NS:.1f} s"
         words = f"{rate:.1f} Hz of {asked:g} asked for"
@@ -168,7 +170,8 @@ class Reporter:
         )
 
     def _unit_values(self, unit: int, now: int) -> tuple[tuple[str, str], ...]:
-        number, track = self._message(unit), self._vehicle.units.get(unit, UnitTrack())
+        number = self._message(unit)
+        track = self._vehicle.units.get(unit, UnitTrack())
         return (
             ("topic", self._topics[unit]),
             ("message", MESSAGES[number].name if number is not None else "none"),
@@ -261,7 +264,8 @@ class Announcer:
         # Time of the first change since the last texts, ns.
         self._changed: int | None = None
         self._nothing_since: int | None = None
-        self._tokens, self._filled = float(AT_ONCE), 0
+        self._tokens = float(AT_ONCE)
+        self._filled = 0
 
     def hear(self, lines: Sequence[StatusLine], now: int) -> None:
         """Take the monitor's diagnostics, without its name in theirs, at time now, ns."""

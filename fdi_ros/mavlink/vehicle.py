@@ -140,7 +140,8 @@ class Vehicle:
         self.behind = 0.0  #: Age of the last signature that was too old, s.
         self._behind_from: Any = None
         self._mavlink = dialect()
-        self._send, self._seconds = send, seconds
+        self._send = send
+        self._seconds = seconds
         self._verifier = Verifier(settings.key) if settings.key else None
         self._parsers: dict[Any, Any] = {}
         # Before an autopilot is known, messages are sent as system 1.
@@ -195,7 +196,8 @@ class Vehicle:
 
     def _process(self, message: Any, peer: Any, now: int) -> ImuSample | None:
         """Take one message and return its sample, if the autopilot in use sent one."""
-        number, data = message.get_msgId(), bytes(message.get_msgbuf())
+        number = message.get_msgId()
+        data = bytes(message.get_msgbuf())
         header = 10 if data[0] == 0xFD else 6
         sequence, system, component = data[4:7] if header == 10 else data[2:5]
         self.counts["messages"] += 1
@@ -205,7 +207,8 @@ class Vehicle:
             self.counts["unsigned"] += 1
             if self._verifier.behind:
                 self.counts["signed late"] += 1
-                self.behind, self._behind_from = self._verifier.behind, peer
+                self.behind = self._verifier.behind
+                self._behind_from = peer
         elif number == self._mavlink.MAVLINK_MSG_ID_UNKNOWN:
             # Of another dialect: the checksum depends on the unknown layout.
             self.counts["unknown"] += 1
@@ -242,7 +245,8 @@ class Vehicle:
             del self._parsers[peer]
             return []
         if parser.buf_index > _LEFT:
-            parser.buf, parser.buf_index = parser.buf[parser.buf_index :], 0
+            parser.buf = parser.buf[parser.buf_index :]
+            parser.buf_index = 0
         return list(messages)
 
     def _is_ours(
@@ -268,7 +272,8 @@ class Vehicle:
             and self._may_change_to(system, beats, number, now)
         ):
             # It comes into use with its next heartbeat.
-            self.system, self.begun = system, self.begun + 1
+            self.system = system
+            self.begun = self.begun + 1
             self._know_nothing()
         if system != self.system or not is_autopilot:
             self.counts["of others"] += 1
@@ -295,10 +300,8 @@ class Vehicle:
             self._begin_with(message, peer, now)
         self.heard = now
         if beats:
-            self.autopilot, self.armed = (
-                message.autopilot,
-                bool(message.base_mode & ARMED),
-            )
+            self.autopilot = message.autopilot
+            self.armed = bool(message.base_mode & ARMED)
             self._disarmed_at = None if self.armed else self._disarmed_at or now
             self.disarmed = now - (self._disarmed_at or now)
         return True
@@ -322,7 +325,8 @@ class Vehicle:
         self.begun += 1
         self._disarmed_at = self._behind_from = None
         self._out.srcSystem = self.system
-        self._sequence, self._scaled_at = None, now
+        self._sequence = None
+        self._scaled_at = now
         self.events.append(f"{again}autopilot: {self.name}, system {self.system}")
         if again:
             self.streams.ask_again()
@@ -347,7 +351,8 @@ class Vehicle:
         return is_new
 
     def _sample(self, number: int, payload: bytes, now: int) -> ImuSample | None:
-        sample, message = read(number, payload), MESSAGES[number]
+        sample = read(number, payload)
+        message = MESSAGES[number]
         if sample is None:
             if message.unit >= 0 and message.unit not in self.units:
                 self.magnetometers.add(message.unit)
@@ -356,7 +361,8 @@ class Vehicle:
         if sample.unit >= MOST_UNITS or not understood(message.kind, self.autopilot):
             self.counts["of no known unit"] += 1
             return None
-        kind, self.gives_gyros = message.kind, True
+        kind = message.kind
+        self.gives_gyros = True
         if number == SCALED:
             self._scaled_at = now
         elif number == RAW and sample.unit == 0 and now - self._scaled_at > STAND_IN:
@@ -376,12 +382,15 @@ class Vehicle:
         """Return a sample stamped by the monotonic clock here; None: repeated or impossible."""
         track = self.units.setdefault(sample.unit, UnitTrack())
         self.magnetometers.discard(sample.unit)
-        restarts, offset = self.clock.restarts, self.sync.offset(now)
+        restarts = self.clock.restarts
+        offset = self.sync.offset(now)
         time = self.clock.unwrap(
             sample.stamp, now, milliseconds, None if offset is None else now + offset
         )
         if self.clock.restarts != restarts:
-            self.sync, self._found, self.begun = TimeSync(), now, self.begun + 1
+            self.sync = TimeSync()
+            self._found = now
+            self.begun = self.begun + 1
             for other in self.units.values():
                 other.time = -1
             self.streams.ask_again()
@@ -396,7 +405,8 @@ class Vehicle:
         if time <= track.time:
             track.repeated += 1
             return None
-        track.time, track.received = time, track.received + 1
+        track.time = time
+        track.received = track.received + 1
         track.arrivals.append(now)
         if not self.sync.synchronised and now - self._found < UNSYNCHRONISED:
             return None

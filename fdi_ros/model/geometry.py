@@ -117,7 +117,8 @@ class Geometry:
     def two_triad_cone(cls) -> Geometry:
         """Two mirrored three-axis blocks on a cone of half-angle 54.7 deg (Gorelov et al. 2019, eq. 1)."""
         r = np.sqrt(3.0)
-        a, b = (r + 1) / 2, (r - 1) / 2
+        a = (r + 1) / 2
+        b = (r - 1) / 2
         upper = np.array([[1, -1, -1], [1, a, -b], [1, -b, a]])
         return cls(
             np.vstack([upper, upper * [-1, 1, 1]]) / r,
@@ -141,7 +142,9 @@ class Geometry:
     @classmethod
     def cone(cls, n: int) -> Geometry:
         """Build n axes evenly spread on a cone of half-angle arccos(1/sqrt 3) about body z."""
-        azimuth, c, s = 2 * np.pi * np.arange(n) / n, 1 / np.sqrt(3.0), np.sqrt(2 / 3)
+        azimuth = 2 * np.pi * np.arange(n) / n
+        c = 1 / np.sqrt(3.0)
+        s = np.sqrt(2 / 3)
         return cls(
             np.column_stack([s * np.cos(azimuth), s * np.sin(azimuth), np.full(n, c)])
         )
@@ -202,7 +205,8 @@ class Geometry:
     def groups(self) -> tuple[tuple[int, ...], ...]:
         """Groups of indistinguishable channels (``|rho| > 0.999``), each channel in one."""
         same = np.abs(self.rho) > SAME_DIRECTION
-        left, groups = list(range(self.n)), []
+        left = list(range(self.n))
+        groups = []
         while left:
             group = tuple(j for j in left if same[left[0], j])
             groups.append(group)

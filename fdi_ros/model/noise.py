@@ -303,7 +303,8 @@ class FalseAlarmRate:
 
         For a detector that accepts only a run length, a probability is converted.
         """
-        options, probability = dict(vars(self)), self.false_alarm_probability
+        options = dict(vars(self))
+        probability = self.false_alarm_probability
         if (
             probability is not None
             and "run_length" in accepted
@@ -393,7 +394,8 @@ def _half_sphere(m: int) -> tuple[Array, Array]:
         angle = np.pi * (np.arange(360) + 0.5) / 360
         return np.column_stack([np.cos(angle), np.sin(angle)]), np.full(360, 1 / 360)
     nodes, weights = np.polynomial.legendre.leggauss(48)
-    height, azimuth = (nodes + 1) / 2, 2 * np.pi * (np.arange(128) + 0.5) / 128
+    height = (nodes + 1) / 2
+    azimuth = 2 * np.pi * (np.arange(128) + 0.5) / 128
     radius = np.sqrt(1 - height**2)
     points = [
         np.outer(radius, np.cos(azimuth)),
@@ -441,13 +443,16 @@ def solve_log(tail: Callable[[float], float], level: float, start: float) -> flo
     Tails and run lengths are nearly exponential in t.
     """
     target = math.log(level)
-    older, newer = start, start + 0.05
-    f_older, f_newer = math.log(tail(older)) - target, math.log(tail(newer)) - target
+    older = start
+    newer = start + 0.05
+    f_older = math.log(tail(older)) - target
+    f_newer = math.log(tail(newer)) - target
     for _ in range(60):
         if abs(newer - older) < 1e-9 * newer or f_newer == f_older:
             break
         step = f_newer * (newer - older) / (f_newer - f_older)
-        older, f_older = newer, f_newer
+        older = newer
+        f_older = f_newer
         newer = max(newer - step, 0.2 * newer)
         f_newer = math.log(tail(newer)) - target
     return newer
@@ -555,7 +560,8 @@ def summary_line(
         else {}
     )
     span = f"{' to '.join(ends)} {unit}" if ends else "none"
-    isolable, n = int(geometry.isolable.sum()), geometry.n
+    isolable = int(geometry.isolable.sum())
+    n = geometry.n
     smallest_words = f"smallest error detected in one sample at rest with probability {DETECTION:.0%}: {span}"
     if len(ends) > 1:
         smallest_words += ", depending on the channel"

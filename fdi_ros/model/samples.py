@@ -46,7 +46,8 @@ class Block:
     no unit has any."""
 
     def __post_init__(self) -> None:
-        stamp, z = np.asarray(self.stamp), np.asarray(self.z)
+        stamp = np.asarray(self.stamp)
+        z = np.asarray(self.z)
         if z.ndim != 2 or z.dtype.kind not in "fiu":
             raise ConfigError(
                 f"samples have shape {z.shape} of {z.dtype}, expected (N, n) real numbers"

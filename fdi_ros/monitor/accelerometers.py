@@ -70,7 +70,8 @@ def check_accelerometers(config: Config, gyros: int) -> None:
 
 def accelerometer_config(config: Config, units: Sequence[int]) -> Config:
     """Return the settings of the accelerometers of some units, numbers from 0, in units of `FORCE.natural`."""
-    own, chosen = config.accelerometers, places(config, units)
+    own = config.accelerometers
+    chosen = places(config, units)
 
     def of_channels(values: Sequence[Any]) -> tuple[Any, ...]:
         """Pick the values of the channels, where there is one for each."""
@@ -109,7 +110,9 @@ def accelerometer_config(config: Config, units: Sequence[int]) -> Config:
 
 def _unit_settings(config: Config, units: Sequence[int]) -> dict[str, Value]:
     """Return what the accelerometers have in common with the gyros of their units."""
-    imus, noise, chosen = config.imus, config.noise, places(config, units)
+    imus = config.imus
+    noise = config.noise
+    chosen = places(config, units)
     axes = config.accelerometers.axes
 
     def of_channels(values: Sequence[float]) -> tuple[float, ...]:
@@ -165,7 +168,8 @@ def position_variance(config: Config, units: Sequence[int]) -> Array:
 
     Positions are counted from the first place, whose own is known.
     """
-    own, each = config.accelerometers, 3 if config.has_units else 1
+    own = config.accelerometers
+    each = 3 if config.has_units else 1
     std = own.position_std or (0.0 if own.positions else UNKNOWN_POSITION,)
     of_units = [0.0 if unit == 0 else std[unit % len(std)] for unit in units]
     return np.repeat(np.square(of_units), each)
@@ -181,7 +185,8 @@ def felt_units(block: Block) -> tuple[int, ...]:
     force = block.acceleration
     if force is None or (len(block) > 1 and not varies(force.z)):
         return ()
-    felt, heard = _delivering(force), _delivering(block)
+    felt = _delivering(force)
+    heard = _delivering(block)
     units = range(block.z.shape[1] // 3)
     return tuple(unit for unit in units if unit in felt or unit not in heard)
 

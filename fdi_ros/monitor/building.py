@@ -94,7 +94,8 @@ def alarm_probability(config: Config) -> float:
 
 def _false_alarm_rate(config: Config, by_run_length: bool = False) -> FalseAlarmRate:
     """Of what the settings state the first: a run length, if the detector takes one, a probability, a rate per hour."""
-    settings, rate = config.detector, config.sample_rate
+    settings = config.detector
+    rate = config.sample_rate
     if by_run_length and settings.run_length > 0:
         return FalseAlarmRate(run_length=settings.run_length, sample_rate=rate)
     if settings.false_alarm_probability > 0:
@@ -195,7 +196,8 @@ def build_core(config: Config, geometry: Geometry, noise: NoiseModel) -> NDArray
 
 def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> None:
     """Set in core (1,) all settings that may change at run time: rule of decision, estimation, withholding."""
-    settings, rule = core["settings"], config.decision.rule
+    settings = core["settings"]
+    rule = config.decision.rule
     settings["publish_under_doubt"] = config.publish_under_doubt
     settings["guard_declares"] = detector.name == GUARD
     settings["by_evidence"] = rule == "evidence" or (
@@ -206,16 +208,16 @@ def suit_detector(core: NDArray[Any], config: Config, detector: Detector) -> Non
 def _fill_settings(
     settings: Any, config: Config, geometry: Geometry, noise: NoiseModel
 ) -> None:
-    n, integrity = geometry.n, config.integrity
-    settings["n"], settings["natural"] = n, RATE.natural
+    n = geometry.n
+    integrity = config.integrity
+    settings["n"] = n
+    settings["natural"] = RATE.natural
     settings["period"] = 1.0 / config.sample_rate
     describe_sensors(settings["sensors"], geometry, noise)
     settings["largest_noise"] = noise.noise_std.max()
     settings["return_limit"] = normal_isf(RETURN_PROBABILITY / 2)
-    settings["turn_on"], settings["learned"][:n] = (
-        config.bias.turn_on_std,
-        noise.bias_std,
-    )
+    settings["turn_on"] = config.bias.turn_on_std
+    settings["learned"][:n] = noise.bias_std
     settings["max_drift"] = config.bias.max_drift
     settings["risk"] = integrity.risk
     settings["prior"][:n] = np.expm1(
@@ -226,17 +228,16 @@ def _fill_settings(
     settings["members"][: len(geometry.units)] = [
         mask_of(unit) for unit in geometry.units
     ]
-    health, decision = config.health, config.decision
+    health = config.health
+    decision = config.decision
     settings["max_rate"][:n] = health.max_rate
     settings["non_finite_time"] = _nanoseconds(health.non_finite_time)
     settings["stuck_time"] = _nanoseconds(health.stuck_time)
     settings["frozen_time"] = _nanoseconds(health.stuck_time_at_rest)
     settings["stale_time"] = _nanoseconds(config.stale_timeout)
     settings["recovery_time"] = _nanoseconds(health.range_recovery_time)
-    settings["alarms"], settings["window"] = (
-        decision.confirm_alarms,
-        decision.confirm_window,
-    )
+    settings["alarms"] = decision.confirm_alarms
+    settings["window"] = decision.confirm_window
     settings["latch"], settings["clean_time"] = (
         decision.latch,
         _nanoseconds(decision.clean_time),
@@ -245,11 +246,9 @@ def _fill_settings(
 
 
 def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
-    n, fixed, learning = (
-        len(noise.noise_std),
-        config.bias.fixed,
-        config.bias.startup_bias_duration > 0,
-    )
+    n = len(noise.noise_std)
+    fixed = config.bias.fixed
+    learning = config.bias.startup_bias_duration > 0
     bias["given"] = bool(fixed)
     bias["value"][:n] = bias["centre"][:n] = fixed or 0.0
     bias["known"] = mask_of(range(n))
@@ -257,7 +256,8 @@ def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
     bias["max_rate"] = config.bias.max_rest_rate
     prepare_limits(bias)
     bias["max_std"][:n] = REST_NOISE * noise.noise_std
-    bias["learning"], bias["outcome"] = learning, LEARNING if learning else FIXED
+    bias["learning"] = learning
+    bias["outcome"] = LEARNING if learning else FIXED
 
 
 def _nanoseconds(seconds: float) -> int:

@@ -191,7 +191,8 @@ def describe(
         if about := _words_about(channel.name, concerns):
             worse[channel.name] = [*worse.get(channel.name, ()), *about]
     if warning:
-        level, message = max(level, Level.WARN), f"{message}; {warning}"
+        level = max(level, Level.WARN)
+        message = f"{message}; {warning}"
     word = Word.CANNOT_TELL if silent is not None else live_word(status, concerns)
     values = (("verdict", word.value), *_whole_values(status), *figures)
     rows = [(WHOLE, level, message, values)]
@@ -247,10 +248,8 @@ def _find_worse(status: Status) -> dict[str, list[str]]:
     }
     for unit in status.units:
         if abs(unit.delay) > max(CERTAIN * unit.delay_std, LEAST_DELAY):
-            side, off = (
-                "late" if unit.delay > 0 else "early",
-                ", taken off" if unit.taken_off else "",
-            )
+            side = "late" if unit.delay > 0 else "early"
+            off = ", taken off" if unit.taken_off else ""
             size = f"{1e3 * abs(unit.delay):.1f} +- {1e3 * unit.delay_std:.1f} ms"
             found[unit.name] = [
                 f"its stamps are {size} {side} against {unit.against}'s{off}"
@@ -259,10 +258,14 @@ def _find_worse(status: Status) -> dict[str, list[str]]:
 
 
 def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
-    words, bias, unit = [], status.config.bias, channel.unit
-    own, section = bias.max_drift, "bias"
+    words = []
+    bias = status.config.bias
+    unit = channel.unit
+    own = bias.max_drift
+    section = "bias"
     if unit == FORCE.unit:
-        own, section = status.config.accelerometers.max_drift, "accelerometers"
+        own = status.config.accelerometers.max_drift
+        section = "accelerometers"
     if channel.noisy:
         times = (
             f"{channel.noise:.2g}" if channel.noise < 100 else f"{channel.noise:.0f}"
@@ -301,10 +304,8 @@ def _whole_message(
         f"degraded: {', '.join(about)}" if about else "",
         first_of(list(map(str, concerns)), MOST_CONCERNS, "; ") if concerns else "",
     ]
-    count, note = (
-        _healthy_words(status, healthy),
-        "".join(f"; {one}" for one in words if one),
-    )
+    count = _healthy_words(status, healthy)
+    note = "".join(f"; {one}" for one in words if one)
     if not status.has_rate:
         return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"
     odd = (
@@ -396,7 +397,8 @@ def _why_no_rate(status: Status) -> str:
 
 
 def _reach(status: Status) -> str:
-    detect, isolate = len(status.can_detect), len(status.can_isolate)
+    detect = len(status.can_detect)
+    isolate = len(status.can_isolate)
     alive = sum(not channel.is_left_out for channel in status.channels)
     if not detect:
         return "no further fault would be detected"
@@ -531,7 +533,8 @@ def _channel_values(
         if channel.last_received
         else "never"
     )
-    pair, unit = status.apart, channel.unit
+    pair = status.apart
+    unit = channel.unit
     scales = [
         error
         for error in status.errors

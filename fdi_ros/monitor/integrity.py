@@ -75,13 +75,15 @@ class Integrity:
         noise: NoiseModel,
     ) -> None:
         noise = noise.for_channels(geometry.n)
-        self.risk, self.alarm_probability = settings.risk, alarm_probability
+        self.risk = settings.risk
+        self.alarm_probability = alarm_probability
         unnoticed = [
             -math.expm1(-rate * settings.exposure) for rate in settings.fault_rate
         ]
         self.prior: Array = np.broadcast_to(np.array(unnoticed), geometry.n)
         """(n,) probability that a channel is faulty unnoticed."""
-        self._axes, self._noise = geometry.axes, noise.noise_std**2
+        self._axes = geometry.axes
+        self._noise = noise.noise_std**2
         norm = np.linalg.norm(geometry.axes, axis=1)
         scale = noise.scale_std * norm * settings.max_rate
         timing = noise.timing_std * norm * settings.max_acceleration
@@ -96,12 +98,11 @@ class Integrity:
         n = len(self._axes)
         for mask in masks:
             if not subsets["has_level"][mask]:
-                known, subset = self.of(flags_of(mask, n)), subsets[mask]
-                subset["level"], subset["limit"][:n], subset["share"][:n] = (
-                    known.level,
-                    known.limit,
-                    known.share,
-                )
+                known = self.of(flags_of(mask, n))
+                subset = subsets[mask]
+                subset["level"] = known.level
+                subset["limit"][:n] = known.limit
+                subset["share"][:n] = known.share
                 subset["has_level"] = True
 
     def after_loss(self, subsets: NDArray[Any], mask: int) -> Axes:
@@ -122,10 +123,8 @@ class Integrity:
         """Level with the channels in mask (n,) fused, for variances (n,), (rad/s)^2, or noise_std^2."""
         kept = np.flatnonzero(mask)
         limit = np.full(len(mask), np.inf)
-        axes, variance = (
-            self._axes[kept],
-            (self._noise if variances is None else variances)[kept],
-        )
+        axes = self._axes[kept]
+        variance = (self._noise if variances is None else variances)[kept]
         nothing = ProtectionLevel(np.full(3, np.inf), limit, np.zeros((len(mask), 3)))
         if not spans_space(axes):
             return nothing
@@ -207,9 +206,12 @@ def _share(level: Array, share: Array, modes: _Modes) -> Array:
 
 def _solve(sigma: Array, prior: Array, modes: _Modes, risk: float) -> Array:
     """Level (3,) from the sigma (3,) of the fused rate, the priors (k,) and the fault modes."""
-    priors, sigmas, limits = modes.prior, modes.sigma, modes.limit
+    priors = modes.prior
+    sigmas = modes.sigma
+    limits = modes.limit
     covered = np.isfinite(limits[:, 0])
-    none, by_number = float((1 - prior).prod()), np.ones(1)
+    none = float((1 - prior).prod())
+    by_number = np.ones(1)
     # Probability of each number of faulty channels, without cancellation: the product
     # of all 1 - p + p x.
     for p in prior:
@@ -217,7 +219,9 @@ def _solve(sigma: Array, prior: Array, modes: _Modes, risk: float) -> Array:
     budget = risk - float(by_number[3:].sum()) - float(priors[~covered].sum())
     if budget <= 0:
         return np.full(3, np.inf)
-    priors, sigmas, limits = priors[covered, None], sigmas[covered], limits[covered]
+    priors = priors[covered, None]
+    sigmas = sigmas[covered]
+    limits = limits[covered]
 
     def missed(level: Array) -> Array:
         faulty = np.where(
@@ -226,14 +230,13 @@ def _solve(sigma: Array, prior: Array, modes: _Modes, risk: float) -> Array:
         return 2 * none * _tail(level / sigma) + (priors * faulty).sum(axis=0)
 
     reach = normal_isf(min(budget / 2, 0.5))
-    low, high = (
-        np.zeros(3),
-        np.vstack([limits + reach * sigmas, reach * sigma]).max(axis=0),
-    )
+    low = np.zeros(3)
+    high = np.vstack([limits + reach * sigmas, reach * sigma]).max(axis=0)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         above = missed(middle) > budget
-        low, high = np.where(above, middle, low), np.where(above, high, middle)
+        low = np.where(above, middle, low)
+        high = np.where(above, high, middle)
     return high
 
 

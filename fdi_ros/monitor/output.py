@@ -314,7 +314,8 @@ class SampleOutput:
 
 
 def _fill_fused(out: Template, rows: Rows, n: int, m: int, shift: int) -> None:
-    row, other = rows.gyros, rows.accelerometers
+    row = rows.gyros
+    other = rows.accelerometers
     instant = int(row["instant"]) - shift
     fill_imu(out.bytes, out.at, instant, row["rate"], row["covariance"])
     if m and other["valid"]:
@@ -355,7 +356,8 @@ class Encoder:
     """
 
     def __init__(self, frame_id: str, names: Sequence[str], gyros: int) -> None:
-        self.n, self.m = gyros, len(names) - gyros
+        self.n = gyros
+        self.m = len(names) - gyros
         self.templates = {
             output: output.make(frame_id, names, gyros) for output in OUTPUTS
         }

@@ -134,7 +134,8 @@ class Pipeline:
 
     def sense(self, units: Iterable[int]) -> None:
         """Judge the accelerometers of these units, by their numbers, from now on; of fewer than two none."""
-        chosen, self.undecided = tuple(units), False
+        chosen = tuple(units)
+        self.undecided = False
         self.felt = chosen if len(chosen) > 1 else ()
         self.accelerometers = self.build_accelerometers(chosen) if self.felt else None
 
@@ -151,7 +152,8 @@ class Pipeline:
             self.sense(felt_units(block))
         if self.accelerometers is None:
             return replace(block, acceleration=None)
-        given, columns = block.acceleration, places(self.config, self.felt)
+        given = block.acceleration
+        columns = places(self.config, self.felt)
         if given is None:
             nothing = np.full((len(block), len(columns)), np.nan)
             given = Block(block.stamp, nothing, np.zeros(nothing.shape, dtype=bool))
@@ -318,7 +320,8 @@ class Pipeline:
             except GeometryError as error:
                 raise ConfigError(f"accelerometers: {error}") from None
             settings = other.core["settings"][0]
-            settings["first"], settings["natural"] = self.geometry.n, FORCE.natural
+            settings["first"] = self.geometry.n
+            settings["natural"] = FORCE.natural
             arms = lever_arms(self.config, units)
             settings["places"][: len(arms)] = places(self.config, units)
             settings["arms"][: len(arms)], settings["lever"] = arms, arms.any()
@@ -364,7 +367,8 @@ class Pipeline:
                 )
                 _ = guard.bank, detector.bank
         else:
-            guard, detector = self.guard, self.detector
+            guard = self.guard
+            detector = self.detector
         if before is None or alarm_probability(config) != alarm_probability(before):
             self.integrity = Integrity(
                 config.integrity, alarm_probability(config), self.geometry, self.noise
@@ -374,7 +378,8 @@ class Pipeline:
             # What was learned of the sensors holds for another threshold as well.
             guard.states[:] = self.guard.states
             guard.clear()
-        self.guard, self.detector = guard, detector
+        self.guard = guard
+        self.detector = detector
         self.path = Path(
             self.core,
             self.subsets,
@@ -393,7 +398,9 @@ class Pipeline:
 
     def _parts(self, samples: NDArray[Any], stop: bool) -> Iterator[Output]:
         """Process samples in one part, or in parts that stop at a sample with events."""
-        halves, paths, size = self.halves, self.paths, len(samples)
+        halves = self.halves
+        paths = self.paths
+        size = len(samples)
         outs = allocate(OutputRow, size), allocate(OutputRow, size * (len(halves) - 1))
         events: list[Event] = []
         first = row = 0
@@ -413,13 +420,16 @@ class Pipeline:
                         rows["level"][row - 1] = half.core["last"]["level"][0]
             if (events and stop and not is_between) or row == size:
                 yield self._output((outs[0][first:row], outs[1][first:row]), events)
-                first, events = row, []
+                first = row
+                events = []
 
     def _output(
         self, rows: tuple[NDArray[Any], NDArray[Any]], events: list[Event]
     ) -> Output:
         """Put together what samples gave, rows (N,) of gyros and accelerometers, which leave in their unit."""
-        names, n, acceleration = self.channel_names, self.geometry.n, None
+        names = self.channel_names
+        n = self.geometry.n
+        acceleration = None
         if self.accelerometers is not None:
             for name in ("rate", "residual", "level"):
                 rows[1][name] *= FORCE.natural
@@ -445,14 +455,18 @@ class Pipeline:
     def _checked(self, block: Block) -> NDArray[Any]:
         """Return the samples of a block as the sample path takes them, (N,) `Sample`."""
         block = self.arranged(block)
-        stamp, z, n = np.asarray(block.stamp), np.asarray(block.z), self.geometry.n
+        stamp = np.asarray(block.stamp)
+        z = np.asarray(block.z)
+        n = self.geometry.n
         count = len(z)
         if z.shape[1] != n:
             raise ConfigError(f"samples have shape {z.shape}, expected (N, {n})")
         if count > 1 and (stamp[1:] <= stamp[:-1]).any():
             raise ConfigError("stamps of the samples do not increase")
         if count:
-            first, end, last = int(stamp[0]), int(stamp[-1]), int(self._last_stamp[0])
+            first = int(stamp[0])
+            end = int(stamp[-1])
+            last = int(self._last_stamp[0])
             if not -MAX_STAMP < first <= end < MAX_STAMP:
                 raise ConfigError(
                     f"stamps go from {first} to {end} ns, expected within {MAX_STAMP} ns of 0"
@@ -463,10 +477,12 @@ class Pipeline:
                     f"stamp {first} ns does not come after the last one, {last} ns"
                 )
         samples = allocate(Sample, count)
-        samples["stamp"], samples["z"][:, :n] = stamp, z
+        samples["stamp"] = stamp
+        samples["z"][:, :n] = z
         samples["received"][:, :n] = True if block.received is None else block.received
         if block.acceleration is not None:
-            force, columns = block.acceleration, places(self.config, self.felt)
+            force = block.acceleration
+            columns = places(self.config, self.felt)
             if force.z.shape[1] != len(columns):
                 raise ConfigError(
                     f"accelerations have shape {force.z.shape}, expected (N, {len(columns)})"

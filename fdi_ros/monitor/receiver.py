@@ -86,8 +86,10 @@ class Watchdog:
         # Where the clock went back, or was not running at the last check, the time
         # between is unknown.
         if count != self._count or now < self.at or not self.at:
-            self._count, self.at = count, now
-        before, self.silent = self.silent, now - self.at > self.timeout
+            self._count = count
+            self.at = now
+        before = self.silent
+        self.silent = now - self.at > self.timeout
         return self.silent != before
 
     def seconds(self, now: int) -> float:
@@ -123,7 +125,8 @@ class SampleRateCheck:
         ]
         if len(rates) < RATE_WINDOWS or max(rates) > (1 + RATE_TOLERANCE) * min(rates):
             return
-        rate, self.words = sum(rates) / RATE_WINDOWS, ""
+        rate = sum(rates) / RATE_WINDOWS
+        self.words = ""
         if abs(rate / self._configured - 1) > RATE_TOLERANCE:
             self.words = (
                 f"samples come at {rate:.3g} Hz, sample_rate is {self._configured:g} Hz:"
@@ -138,7 +141,8 @@ class Receiver:
     """Takes messages one at a time, aligns those of several units, and has the pipeline work one sample a call."""
 
     def __init__(self, pipeline: Pipeline) -> None:
-        config, n = pipeline.config, pipeline.geometry.n
+        config = pipeline.config
+        n = pipeline.geometry.n
         self.pipeline = pipeline
         self.source = source_of(config)
         self.alignment = Alignment(*self.source.alignment)
@@ -167,7 +171,8 @@ class Receiver:
         fused, integrity = (
             self.encoder.templates[output] for output in (FUSED, INTEGRITY)
         )
-        self.live["fused_at"], self.live["integrity_at"] = fused.at, integrity.at
+        self.live["fused_at"] = fused.at
+        self.live["integrity_at"] = integrity.at
         self._records = (
             len(pipeline.halves),
             self.alignment.rows,
@@ -220,7 +225,8 @@ class Receiver:
     def refused(self, unit: int, data: bytes) -> None:
         """Keep why a message was refused."""
         code = int(self.live["inlets"]["error"][0, unit])
-        n, m = self.live["channels"][0], self.live["accelerometers"][0]
+        n = self.live["channels"][0]
+        m = self.live["accelerometers"][0]
         expected = self.source.brought(unit, int(n), int(m)).size
         self.errors[unit] = self.source.explain(code, data, expected)
 
@@ -263,7 +269,8 @@ class Receiver:
         aside: Any = tuple(one.copy() for one in records)
         kind.receive(self.alignment.rows.copy(), self.live.copy(), 0, _NOTHING, 0)
         process((path, path), halves, *aside)
-        row, names = path.core[0]["last"], self.pipeline.geometry.channel_names
+        row = path.core[0]["last"]
+        names = self.pipeline.geometry.channel_names
         encoder = Encoder("", 2 * names, len(names))
         for output in OUTPUTS:
             encoder.fill(output, Rows(row, row))

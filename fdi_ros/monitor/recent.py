@@ -92,7 +92,8 @@ class RecentHealth:
 
     def _channels(self, status: Status) -> Iterator[ChannelHealth]:
         """Yield each channel in use that is not declared faulty."""
-        first, last = self._readings[0], self._readings[-1]
+        first = self._readings[0]
+        last = self._readings[-1]
         samples, missing, non_finite, at_end, spikes = last.counts - first.counts
         total = samples + missing
         unchecked = np.mean([one.unchecked for one in self._readings], axis=0)

@@ -68,12 +68,11 @@ DAMAGED = (
 
 def _content(pipeline: Pipeline) -> dict[str, Any]:
     """Return the lasting state of the gyros, in the fields of the file, with channels by name and biases in rad/s."""
-    core, names = pipeline.core[0], pipeline.geometry.channel_names
-    bias, decision, learned = (
-        core["bias"],
-        core["decision"],
-        not core["bias"]["learning"],
-    )
+    core = pipeline.core[0]
+    names = pipeline.geometry.channel_names
+    bias = core["bias"]
+    decision = core["decision"]
+    learned = not core["bias"]["learning"]
     return {
         "bias": dict(zip(names, bias["value"][: len(names)].tolist(), strict=True))
         if learned
@@ -103,11 +102,10 @@ def _errors(detector: Detector) -> dict[str, Array] | None:
     """Return the estimates of ``ERROR_KINDS``, (N,), (N, N), and corrected delays, s, or None."""
     if not detector.states[0]["begun"]:
         return None
-    estimator, count = (
-        detector.states[0]["estimator"],
-        int(detector.constants[0]["layout"]["count"]),
-    )
-    x, p = estimator["states"]["x"][:count], estimator["states"]["p"][:count, :count]
+    estimator = detector.states[0]["estimator"]
+    count = int(detector.constants[0]["layout"]["count"])
+    x = estimator["states"]["x"][:count]
+    p = estimator["states"]["p"][:count, :count]
     late = estimator["late"][: len(detector.geometry.units)]
     return {"value": x.copy(), "covariance": p.copy(), "late": late.copy()}
 
@@ -128,7 +126,8 @@ def _differs(state: dict[str, Any], kept: dict[str, Any] | None) -> bool:
     other = state.get("accelerometers")
     if other is not None and _differs(other, kept["accelerometers"]):
         return True
-    now, then = state["errors"], kept["errors"]
+    now = state["errors"]
+    then = kept["errors"]
     if now is None or then is None:
         return now is not then
     std, std_then = (np.sqrt(np.diag(errors["covariance"])) for errors in (now, then))
@@ -143,15 +142,11 @@ def _parsed(saved: Any, pipeline: Pipeline) -> dict[str, Any]:
 
     Raise a refusal, or one of `DAMAGED`.
     """
-    names, detector, settings = (
-        pipeline.geometry.channel_names,
-        pipeline.guard,
-        pipeline.config.bias,
-    )
-    faulty, ambiguous = (
-        dict(saved["declared"]["faulty"]),
-        list(saved["declared"]["ambiguous"]),
-    )
+    names = pipeline.geometry.channel_names
+    detector = pipeline.guard
+    settings = pipeline.config.bias
+    faulty = dict(saved["declared"]["faulty"])
+    ambiguous = list(saved["declared"]["ambiguous"])
     sane = faulty.keys().isdisjoint(ambiguous) and {
         *faulty,
         *ambiguous,
@@ -172,7 +167,8 @@ def _parsed(saved: Any, pipeline: Pipeline) -> dict[str, Any]:
     if values.dtype != np.float64 or not np.isfinite(values).all():
         raise ValueError
     state["bias"] = dict(zip(names, values.tolist(), strict=True))
-    off, bound = values - np.array(settings.fixed or 0.0), settings.max_rest_rate
+    off = values - np.array(settings.fixed or 0.0)
+    bound = settings.max_rest_rate
     if saved["errors"] is not None:
         state["errors"] = _parsed_errors(saved["errors"], detector)
     if (largest := float(np.abs(off).max())) > bound:
@@ -211,10 +207,8 @@ def _parsed_errors(saved: Any, detector: Detector) -> dict[str, Array]:
 
     Raise one of `DAMAGED` if they are invalid or of another detector.
     """
-    count, units = (
-        int(detector.constants[0]["layout"]["count"]),
-        len(detector.geometry.units),
-    )
+    count = int(detector.constants[0]["layout"]["count"])
+    units = len(detector.geometry.units)
     value, triangle, late = (
         np.array(saved[name], dtype=np.float64)
         for name in ("value", "covariance", "late")
@@ -246,12 +240,12 @@ def _check(
     errors: dict[str, Array], detector: Detector, bias: Array, settings: BiasConfig
 ) -> None:
     """Refuse errors that are not plausible beside biases (n,) at the start, rad/s."""
-    geometry, layout, value = (
-        detector.geometry,
-        detector.constants[0]["layout"],
-        errors["value"],
-    )
-    n, count, turn_on = geometry.n, len(value), settings.turn_on_std
+    geometry = detector.geometry
+    layout = detector.constants[0]["layout"]
+    value = errors["value"]
+    n = geometry.n
+    count = len(value)
+    turn_on = settings.turn_on_std
     prior = layout["prior"][:count].copy()
     prior[:n] = turn_on
     limit = PLAUSIBLE * np.sqrt(prior**2 + np.diag(errors["covariance"]))
@@ -263,10 +257,8 @@ def _check(
         raise RefusalError(
             f"error state {worst + 1} is {value[worst]:.3g}, expected within {limit[worst]:.3g}"
         )
-    common, most = (
-        float(np.abs(geometry.least_squares @ (bias + value[:n])).max()),
-        PLAUSIBLE * turn_on,
-    )
+    common = float(np.abs(geometry.least_squares @ (bias + value[:n])).max())
+    most = PLAUSIBLE * turn_on
     if common > most:
         raise RefusalError(
             f"its biases pass for a turn of {common:.3g} rad/s, expected within {most:.3g}"
@@ -275,20 +267,17 @@ def _check(
 
 def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
     """Write a state of a certain age, s, into the records of a monitor."""
-    core, n = pipeline.core[0], pipeline.geometry.n
+    core = pipeline.core[0]
+    n = pipeline.geometry.n
     names = pipeline.geometry.channel_names
-    settings, faulty, ambiguous = (
-        core["settings"],
-        state["declared"]["faulty"],
-        state["declared"]["ambiguous"],
-    )
+    settings = core["settings"]
+    faulty = state["declared"]["faulty"]
+    ambiguous = state["declared"]["ambiguous"]
     if state["bias"] is not None:
         bias = core["bias"]
         bias["value"][:n] = list(state["bias"].values())
-        bias["known"], bias["learning"] = (
-            mask_of(map(names.index, state["known"])),
-            False,
-        )
+        bias["known"] = mask_of(map(names.index, state["known"]))
+        bias["learning"] = False
         bias["outcome"] = IN_MOTION if state["in_motion"] else RESTORED
         std = settings["turn_on"] if state["in_motion"] else settings["learned"][:n]
         core["sample"]["bias_std"][:n] = np.sqrt(
@@ -302,12 +291,11 @@ def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
             state["errors"].values(),
         )
         detector.states["restored"] = True
-        estimator, count = detector.states["estimator"][0], len(value)
+        estimator = detector.states["estimator"][0]
+        count = len(value)
         estimator["late"][: len(late)] = late
-        estimator["states"]["x"][:count], estimator["states"]["p"][:count, :count] = (
-            value,
-            covariance,
-        )
+        estimator["states"]["x"][:count] = value
+        estimator["states"]["p"][:count, :count] = covariance
         predict(
             detector.constants[0]["layout"],
             detector.states["estimator"]["states"][0],
@@ -418,13 +406,12 @@ class StateFile:
                         self.path.replace(self._old)
                     self.is_rejected = False
         except OSError as error:
-            self.words, self.failed = (
-                f"state cannot be saved to {self.path}: {error.strerror}",
-                True,
-            )
+            self.words = f"state cannot be saved to {self.path}: {error.strerror}"
+            self.failed = True
             self._not_before = time.monotonic() + RETRY
         else:
-            self._kept, self.failed = state, False
+            self._kept = state
+            self.failed = False
             self.words = f"state saved to {self.path}"
         return True
 

@@ -232,8 +232,12 @@ def status_of(
     """
     natural = quantity.natural
     geometry = detector.geometry
-    names, n, now, last = geometry.channel_names, geometry.n, core["now"], core["last"]
-    begun, state = bool(core["samples"]), core["state"][:n]
+    names = geometry.channel_names
+    n = geometry.n
+    now = core["now"]
+    last = core["last"]
+    begun = bool(core["samples"])
+    state = core["state"][:n]
     repeated = flags_of(int(core["copies"]["channels"]), n)
     detectable, isolable, note, rests_on = _capability(
         detector, ~(np.isin(state, LOST) | repeated)
@@ -289,8 +293,10 @@ def _channel(
     core: Any, i: int, names: Sequence[str], quantity: Quantity
 ) -> ChannelStatus:
     natural = quantity.natural
-    health, state = core["health"], ChannelState(core["state"][i])
-    count, begun = health["counts"][:, i], bool(core["samples"])
+    health = core["health"]
+    state = ChannelState(core["state"][i])
+    count = health["counts"][:, i]
+    begun = bool(core["samples"])
     return ChannelStatus(
         name=names[i],
         state=state,
@@ -342,7 +348,8 @@ def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
     method = detector.fewer(bits)
     if method is None:
         return detectable, isolable, detector.refusals[bits], ""
-    detectable[mask], isolable[mask] = reduced.detectable, method.isolable
+    detectable[mask] = reduced.detectable
+    isolable[mask] = method.isolable
     limits = (
         (mask & ~detectable, "not be seen"),
         (detectable & ~isolable, "be seen but not isolated"),
@@ -383,7 +390,8 @@ def _delays(guard: Detector, begun: bool) -> tuple[Array, Array]:
         return np.zeros((0, 1)), np.zeros((0, 1))
     estimator = guard.states[0]["estimator"]
     places = [place for (place,) in places_of("delay", guard.geometry.n, units)]
-    value, covariance = estimator["late"][:units].copy(), np.zeros((units, units))
+    value = estimator["late"][:units].copy()
+    covariance = np.zeros((units, units))
     value[1:] += estimator["states"]["x"][places]
     covariance[1:, 1:] = estimator["states"]["p"][np.ix_(places, places)]
     variance = (
@@ -398,7 +406,8 @@ def _units(
     core: Any, guard: Detector, late: Array, late_std: Array
 ) -> tuple[UnitStatus, ...]:
     """Units of several channels. With three or more, lateness counts against the middle one."""
-    geometry, measured = guard.geometry, len(late) > 0
+    geometry = guard.geometry
+    measured = len(late) > 0
     names = _unit_names(geometry)
     middle = int(np.argsort(late[:, 0])[(len(late) - 1) // 2]) if len(late) > 2 else 0
     off = guard.states[0]["estimator"]["late"] if measured else np.zeros(len(names))
@@ -418,7 +427,8 @@ def _units(
 
 def _frozen(core: Any, channels: Sequence[int]) -> float:
     """Time for which a unit has certainly given old values, s, 0 if none."""
-    unit, now = mask_of(channels), core["now"]
+    unit = mask_of(channels)
+    now = core["now"]
     seconds = (
         float(core["last"]["stamp"] - core["health"]["run_stamp"][list(channels)].max())
         / 1e9
@@ -436,12 +446,12 @@ def _errors(
 ) -> tuple[ErrorStatus, ...]:
     if not begun:
         return ()
-    estimator, layout, names = (
-        guard.states[0]["estimator"],
-        guard.constants[0]["layout"],
-        guard.geometry,
-    )
-    states, units, found = estimator["states"], _unit_names(names), []
+    estimator = guard.states[0]["estimator"]
+    layout = guard.constants[0]["layout"]
+    names = guard.geometry
+    states = estimator["states"]
+    units = _unit_names(names)
+    found = []
     prior = np.sqrt(
         layout["prior"] ** 2 + layout["walk"] ** 2 * float(estimator["seconds"])
     )
@@ -459,10 +469,8 @@ def _errors(
                 f" {k + 1}" for k in range(len(places))
             ]
             for place, part in zip(places, parts, strict=True):
-                value, std = (
-                    float(states["x"][place]),
-                    float(np.sqrt(states["p"][place, place])),
-                )
+                value = float(states["x"][place])
+                std = float(np.sqrt(states["p"][place, place]))
                 found.append(
                     ErrorStatus(
                         owner,
@@ -478,19 +486,21 @@ def _errors(
 
 def _apart(guard: Detector, core: Any, quantity: Quantity) -> ApartStatus | None:
     """Find the pair of one axis, in the set that is declared, that differs by most of its standard deviations."""
-    geometry, group = guard.geometry, set(members(int(core["group"])))
-    case, found, largest = guard.states[0]["case"], None, 0.0
+    geometry = guard.geometry
+    group = set(members(int(core["group"])))
+    case = guard.states[0]["case"]
+    found = None
+    largest = 0.0
     for a, b in lone_pairs(geometry) if group else ():
         if not group.issuperset((a, b)):
             continue
-        size, std = abs(float(core["error"][b])), math.nan
+        size = abs(float(core["error"][b]))
+        std = math.nan
         if case["open"]:
             # The detector explains the mean since the onset, with all its uncertainty.
-            axes, mean, covariance = (
-                geometry.axes,
-                case["inference"]["y"],
-                case["inference"]["covariance"],
-            )
+            axes = geometry.axes
+            mean = case["inference"]["y"]
+            covariance = case["inference"]["covariance"]
             share = float(axes[a] @ axes[b]) / float(axes[b] @ axes[b])
             size = abs(float(mean[a] - share * mean[b]))
             std = math.sqrt(
@@ -506,16 +516,14 @@ def _apart(guard: Detector, core: Any, quantity: Quantity) -> ApartStatus | None
         certainty = size / std if std > 0.0 else math.inf
         if certainty > largest and (len(group) == 2 or certainty >= CERTAIN):
             names = geometry.channel_names[a], geometry.channel_names[b]
-            found, largest = (
-                ApartStatus(
-                    names,
-                    one_of_words(geometry, (a, b)),
-                    quantity.natural * size,
-                    quantity.natural * std,
-                    quantity.unit,
-                ),
-                certainty,
+            found = ApartStatus(
+                names,
+                one_of_words(geometry, (a, b)),
+                quantity.natural * size,
+                quantity.natural * std,
+                quantity.unit,
             )
+            largest = certainty
     return found
 
 
@@ -553,18 +561,14 @@ def _format_bias(bias: Any, names: Sequence[str], turn_on: float) -> str:
 
 
 def _format_refusal(bias: Any, names: Sequence[str]) -> str:
-    heard, restless = (
-        int(bias["heard"]).bit_count(),
-        list(members(int(bias["restless"]))),
-    )
+    heard = int(bias["heard"]).bit_count()
+    restless = list(members(int(bias["restless"])))
     if bias["outcome"] == TOO_FEW:
         return f": {heard} channels gave {bias['rows']} samples, expected 3 and {LEAST_ROWS} at least"
-    mean, std, max_mean, max_std = (
-        bias["average"],
-        bias["scatter"],
-        bias["max_rate"],
-        bias["max_std"],
-    )
+    mean = bias["average"]
+    std = bias["scatter"]
+    max_mean = bias["max_rate"]
+    max_std = bias["max_std"]
     if len(restless) > 1:
         worst = max(
             restless, key=lambda i: abs(mean[i]) / max_mean + std[i] / max_std[i]

@@ -132,7 +132,8 @@ class Condition:
 
 def _measure(name: str, judgement: Judgement) -> tuple[float, str]:
     """Return the value of a quantity of the recording, and a sentence with it."""
-    scores, story = judgement.scores, judgement.story
+    scores = judgement.scores
+    story = judgement.story
     if name == "judged":
         share = scores.samples_judged / max(1, scores.samples)
         return (
@@ -140,7 +141,8 @@ def _measure(name: str, judgement: Judgement) -> tuple[float, str]:
             f"{scores.samples_judged} of {scores.samples} samples were judged, {share:.4f}",
         )
     if name == "unchecked":
-        lost, total = judgement.unchecked_channels, len(judgement.monitor.channels)
+        lost = judgement.unchecked_channels
+        total = len(judgement.monitor.channels)
         return (
             len(lost),
             f"{len(lost)} of {total} channels end unchecked{': ' if lost else ''}{unchecked_words(lost)}",
@@ -226,7 +228,9 @@ def parse_check(text: str, faults: int, names: Sequence[str] = ()) -> list[Condi
 def _on_quantity(part: str) -> Condition:
     match = _TERM.fullmatch(part)
     assert match is not None
-    name, sign, number = match[1], match[2] or "", match[3]
+    name = match[1]
+    sign = match[2] or ""
+    number = match[3]
     if name not in _QUANTITIES:
         raise ConfigError(
             f"--check: unknown condition {part!r}, {did_you_mean(name, tuple(_QUANTITIES))};"

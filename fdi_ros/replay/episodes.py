@@ -243,7 +243,8 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     """Return the size of an error with its standard error and course. Empty: not known."""
     if size is None:
         return ""
-    value, std = size.rad_s * unit.factor, size.std_rad_s * unit.factor
+    value = size.rad_s * unit.factor
+    std = size.std_rad_s * unit.factor
     figure = f"{plus_minus(abs(value), std)} {unit.name}"
     if size.course == "proportional":
         # Two significant digits without an exponent.
@@ -279,7 +280,8 @@ def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
     """Describe an episode in one sentence, without a full stop."""
     unit = unit_for(one, unit)
     until = "" if one.stands else f" to {one.end_s:.3f} s"
-    about, before = _about(one, unit), _before(one)
+    about = _about(one, unit)
+    before = _before(one)
     if one.apart is not None:
         where = (
             ""

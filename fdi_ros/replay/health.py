@@ -124,7 +124,8 @@ def _delivery(shares: Array, times: Array, width: float, rate: float) -> Deliver
     """
     # The first window is incomplete.
     begun = int(np.flatnonzero(shares > 0)[0]) + 1
-    shares, times = shares[begun:], times[begun:]
+    shares = shares[begun:]
+    times = times[begun:]
     if not len(shares):
         return Delivery(1.0, None)
     share = float(shares.mean())
@@ -182,7 +183,9 @@ class Values:
         """Count the samples of a channel at the end of its range."""
         largest = float(size.max())
         if largest > self._largest[i]:
-            self._largest[i], self._run[i], self.saturated[i] = largest, 0, 0
+            self._largest[i] = largest
+            self._run[i] = 0
+            self.saturated[i] = 0
         at_end = size == largest
         edges = np.flatnonzero(np.diff(np.concatenate([[0], at_end, [0]])))
         for first, last in edges.reshape(-1, 2).tolist():

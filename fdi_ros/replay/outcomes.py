@@ -95,11 +95,10 @@ def score(
         Time in which an isolation or a set counts, s. A wrong isolation counts at any time.
     """
     own = [] if channel is None else [channel]
-    others, soon = np.delete(alone, own, axis=1), since <= within
-    isolated, detected = (
-        _first(alone[:, own], since),
-        _first(alone[:, own] | among[:, own], since),
-    )
+    others = np.delete(alone, own, axis=1)
+    soon = since <= within
+    isolated = _first(alone[:, own], since)
+    detected = _first(alone[:, own] | among[:, own], since)
     found = isolated <= within and isolated < np.inf
     outcome = outcome_of(
         bool(others.any()),
@@ -268,7 +267,9 @@ class Followed:
     def __init__(
         self, fault: Fault, channels: Sequence[int], names: Sequence[str]
     ) -> None:
-        self.fault, self.channels, self.begun = fault, channels, False
+        self.fault = fault
+        self.channels = channels
+        self.begun = False
         struck = tuple(names[i] for i in channels)
         self.outcome = Outcome(
             fault.channel,
@@ -297,11 +298,9 @@ class Followed:
 
     def add(self, stamp: int, change: StateChange) -> None:
         """Add a declaration that this fault explains."""
-        own, at, delay = (
-            self.outcome,
-            change.at_s,
-            round(change.at_s - self.fault.start, 9),
-        )
+        own = self.outcome
+        at = change.at_s
+        delay = round(change.at_s - self.fault.start, 9)
         if self.detected_stamp is None:
             self.detected_stamp = stamp
             own = replace(
@@ -323,7 +322,8 @@ class Followed:
 
     def result(self) -> Outcome:
         """Return the result so far."""
-        false, found = self.false, self.detected_stamp is not None
+        false = self.false
+        found = self.detected_stamp is not None
         kind = outcome_of(
             "FAULTY" in false, self.outcome.isolated, found, "AMBIGUOUS" in false
         )

@@ -165,7 +165,8 @@ class OutputBag(Sink):
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Write the messages that the node would have published."""
         if self._encoder is None:
-            names, n = pipeline.channel_names, pipeline.geometry.n
+            names = pipeline.channel_names
+            n = pipeline.geometry.n
             self._encoder = Encoder(self._frame, names, n)
         for topic, stamp, data in self._encoder.encode(output, self._shift):
             self._writer.write(self._outputs[topic], self._time(stamp), data)
@@ -183,7 +184,9 @@ class OutputBag(Sink):
 
     def _input_status(self, k: int, samples: Samples, now: int) -> InputStatus:
         """Return the state of a topic after the messages so far, by the clock of the recorder."""
-        source, newest, topic = self._source, samples.newest[k], samples.topics[k]
+        source = self._source
+        newest = samples.newest[k]
+        topic = samples.topics[k]
         counts = {"malformed": samples.malformed[topic]}
         if source.stamped:
             counts |= samples.alignment.counters[k]

@@ -164,7 +164,8 @@ class Curves:
 
         ``common``: layout of every plot. ``scale``: how a plot chooses its scale.
         """
-        words, last = self._words, len(self.names) - 1
+        words = self._words
+        last = len(self.names) - 1
         of_residuals = {**scale, "scale": f"{self._own}residuals", **common}
         levels = [
             self._line(f"level.{axis}", axis, colour_of(k))
@@ -204,7 +205,8 @@ class Curves:
 
     def _rate(self, k: int, layout: Mapping[str, Any]) -> Figure:
         """Draw the fused vector along an axis, with the readings of the channels that measure it."""
-        rate, axis = f"rate.{_AXES[k]}", _AXES[k]
+        rate = f"rate.{_AXES[k]}"
+        axis = _AXES[k]
         band = {
             "type": "band",
             "packed": f"{self._own}{rate}",
@@ -257,7 +259,8 @@ class Report(Sink):
     """
 
     def __init__(self, geometry: Geometry, rate: float, unit: Unit = RADIANS) -> None:
-        self._unit, self._sample_rate = unit, rate
+        self._unit = unit
+        self._sample_rate = rate
         self._curves = [Curves(geometry, rate, unit)]
         self._store = PageStore(self._curves[0].kinds)
         self._first_states: list[str] = []
@@ -307,13 +310,16 @@ class Report(Sink):
         if output.acceleration is None:
             return
         _, accelerometers = pipeline.halves
-        rate, geometry = self._sample_rate, accelerometers.geometry
+        rate = self._sample_rate
+        geometry = accelerometers.geometry
         self._curves.append(Curves(geometry, rate, FORCES, FORCE))
         self._store = PageStore(self._curves[0].kinds | self._curves[1].kinds)
 
     def html(self, summary: Summary, about: Mapping[str, str]) -> str:
         """Lay out the page: verdict, episodes, plots and tables. ``about``: head of the page."""
-        scores, story, unit = summary.scores, summary.story, self._unit
+        scores = summary.scores
+        story = summary.story
+        unit = self._unit
         # Injected faults and gaps in the recording are shaded.
         times = [("fault", fault.start_s, fault.stop_s) for fault in scores.faults]
         times += [("gap", begin, end) for begin, end in story.gaps]
@@ -435,7 +441,8 @@ def _episode_section(
 
 def _card(one: Episode, scored: bool, unit: Unit, origin: int | None) -> str:
     room = max(SHOWN_AROUND, 0.2 * one.duration_s)
-    low, high = max(0.0, one.start_s - room), one.end_s + room
+    low = max(0.0, one.start_s - room)
+    high = one.end_s + room
     link = f'<a href="#t={low:.3f},{high:.3f}">show it</a>'
     date = date_of(origin + round(one.start_s * 1e9)) if origin is not None else None
     begin = [("begins", f"{date:%Y-%m-%d %H:%M:%S} UTC")] if date is not None else []
@@ -537,8 +544,10 @@ def _timeline(
 
     ``first``: states at the first sample. Empty: no sample.
     """
-    scores, holes = summary.scores, summary.story.gaps
-    begin, end = scores.start_s, max(scores.end_s, scores.start_s + 1e-9)
+    scores = summary.scores
+    holes = summary.story.gaps
+    begin = scores.start_s
+    end = max(scores.end_s, scores.start_s + 1e-9)
     current = {
         name: (first[i] if first else "UNCHECKED", begin, "")
         for i, name in enumerate(names)

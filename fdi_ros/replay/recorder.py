@@ -106,7 +106,8 @@ class Recorder:
         self, geometry: Geometry, noise: NoiseModel, quantity: Quantity = RATE
     ) -> None:
         """``noise``: noise model in units of the natural size of the quantity."""
-        self._geometry, self._quantity = geometry, quantity
+        self._geometry = geometry
+        self._quantity = quantity
         noise = noise.for_channels(geometry.n)
         norm = np.linalg.norm(geometry.axes, axis=1)
         self._stds: Array = np.array(
@@ -135,8 +136,11 @@ class Recorder:
     def begin_stretch(self) -> None:
         """End the stretch and its open episodes."""
         self._episodes_ended([*self._open], None)
-        self._open, self._before = [], np.zeros_like(self._before)
-        self._tail, self._interval, self._resumed = np.empty((0, 2)), np.inf, np.nan
+        self._open = []
+        self._before = np.zeros_like(self._before)
+        self._tail = np.empty((0, 2))
+        self._interval = np.inf
+        self._resumed = np.nan
         if self._part is not None:
             self._stretches.append(self._part)
         self._part = None
@@ -148,12 +152,14 @@ class Recorder:
         if np.isnan(self._resumed):
             # Units start one after the other, as after a hole.
             self._resumed = float(time[0])
-        resumed, told = self._holes(time), self._told(output.state)
+        resumed = self._holes(time)
+        told = self._told(output.state)
         before = np.vstack([self._before, told[:-1]])
         self._add_to_stretch(time, output, before)
         changes = np.flatnonzero((told != before).any(axis=1)).tolist()
         self._tail = np.vstack([self._tail, np.column_stack([time, _stds(output)])])
-        changed, edges = set(changes), [*dict.fromkeys([0, *changes]), len(time)]
+        changed = set(changes)
+        edges = [*dict.fromkeys([0, *changes]), len(time)]
         reasons = (
             {
                 (event.stamp, event.channel): event.reason.value
@@ -214,7 +220,8 @@ class Recorder:
         """Reduce states (N, n) to declarations. A hidden declaration is kept."""
         if not state.any():
             return state
-        told, in_sets = state.copy(), (state == S.AMBIGUOUS).any(axis=0)
+        told = state.copy()
+        in_sets = (state == S.AMBIGUOUS).any(axis=0)
         for one in self._open:
             if one.kind == S.AMBIGUOUS:
                 in_sets[list(one.members)] = True
@@ -224,10 +231,8 @@ class Recorder:
     def _add_to_stretch(self, time: Array, output: Output, before: Told) -> None:
         """Count samples. ``before``: reduced states before each sample."""
         part = self._part or Stretch(float(time[0]), float(time[0]), 0, 0, 0.0)
-        judged, steps = (
-            np.isfinite(output.threshold),
-            np.diff(np.concatenate([[part.end_s], time])),
-        )
+        judged = np.isfinite(output.threshold)
+        steps = np.diff(np.concatenate([[part.end_s], time]))
         watched = judged & (steps <= HOLE) & ~np.isin(before, _DECLARED).any(axis=1)
         self._part = Stretch(
             part.start_s,
@@ -252,10 +257,8 @@ class Recorder:
         std = float(self._tail[self._row_before(at), 1])
         # A set grows, shrinks, or becomes one channel.
         for one in [one for one in self._open if one.kind == S.AMBIGUOUS]:
-            named, hiding = (
-                new[S.FAULTY] & one.members,
-                {i for i in one.members if now[i] in _HIDING},
-            )
+            named = new[S.FAULTY] & one.members
+            hiding = {i for i in one.members if now[i] in _HIDING}
             members = named or hiding | set(np.flatnonzero(now == S.AMBIGUOUS).tolist())
             if named:
                 one.kind, one.reason = S.FAULTY, reason_of(named) or one.reason
@@ -323,7 +326,8 @@ class Recorder:
 
     def _step(self, one: _Open, members: set[int], at: float) -> None:
         """Add a step with its channels."""
-        one.members, one.since = members, at
+        one.members = members
+        one.since = at
         channels = sorted(members)
         say = one_of_words if one.kind == S.AMBIGUOUS else all_of_words
         names = tuple(self._geometry.channel_names[i] for i in channels)
@@ -376,7 +380,8 @@ class Recorder:
         self, one: _Open, rows: slice, time: Array, output: Output, told: Told
     ) -> None:
         """Add the errors of the channels of an episode, measured by the other channels."""
-        axes, residual = self._geometry.axes, output.residual[rows]
+        axes = self._geometry.axes
+        residual = output.residual[rows]
 
         def add(key: tuple[int, ...], gain: Array, error: Array) -> None:
             if key not in one.batches:
@@ -450,7 +455,8 @@ class Recorder:
         end = self._part.end_s if at is None else at
         if one.kind == S.STALE and one.after_hole and end - one.start < HOLE:
             return None
-        geometry, names = self._geometry, self._geometry.channel_names
+        geometry = self._geometry
+        names = self._geometry.channel_names
         sizes = {
             key[0]: batches.size(one.since)
             for key, batches in one.batches.items()
@@ -541,7 +547,10 @@ class Batches:
     def __init__(
         self, begin: float, noise: float, scale: float = 0.0, bias: float = 0.0
     ) -> None:
-        self._begin, self._noise, self._scale, self._bias = begin, noise, scale, bias
+        self._begin = begin
+        self._noise = noise
+        self._scale = scale
+        self._bias = bias
         self._width = FIRST_WIDTH
         # Number of samples, sum, sum of squares of each batch.
         self._sums = np.zeros((3, MOST))
@@ -552,7 +561,9 @@ class Batches:
     def add(self, time: Array, error: Array, rate: Array) -> None:
         """Add finite samples (N,): time, s, error and rate along the axis, rad/s."""
         known = np.isfinite(error) & (np.abs(error) < SQUARED)
-        time, error, rate = time[known], error[known], np.nan_to_num(rate[known])
+        time = time[known]
+        error = error[known]
+        rate = np.nan_to_num(rate[known])
         if not len(time):
             return
         while time[-1] - self._begin >= MOST * self._width:
@@ -576,7 +587,8 @@ class Batches:
         middle: Array = np.asarray(
             self._begin + (used + 0.5) * self._width, dtype=np.float64
         )
-        samples, whole = float(count.sum()), float(total.sum() / count.sum())
+        samples = float(count.sum())
+        whole = float(total.sum() / count.sum())
         mean_square = float(square.sum() / samples)
         scatter = mean_square - whole**2
         scatter = scatter if scatter > ROUNDING * mean_square else 0.0
@@ -603,7 +615,8 @@ class Batches:
         gone = self._gone(used, mean, then)
         if gone is not None:
             before = middle < gone
-            part, samples_then = mean[before], float(count[used][before].sum())
+            part = mean[before]
+            samples_then = float(count[used][before].sum())
             error = math.hypot(_standard_error(part, scatter, samples_then), lasting)
             return Size(float(part.mean()), error, "gone", last, gone_s=round(gone, 3))
         slope = _trend(middle, mean)

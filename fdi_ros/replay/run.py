@@ -113,7 +113,8 @@ class Walk:
     """
 
     def __init__(self, pipeline: Pipeline, sinks: Sequence[Sink] = ()) -> None:
-        self.pipeline, self.sinks = pipeline, sinks
+        self.pipeline = pipeline
+        self.sinks = sinks
         self.seconds = 0.0
         """Time spent in the pipeline, s."""
         self._last: int | None = None
@@ -145,7 +146,8 @@ class Walk:
     def feed(self, block: Block) -> None:
         """Pass a piece without a long gap through the monitor."""
         stepwise = any(sink.stops_at_events for sink in self.sinks)
-        row, begun = 0, clock()
+        row = 0
+        begun = clock()
         for output in (
             self.pipeline.steps(block) if stepwise else [self.pipeline.process(block)]
         ):
@@ -238,7 +240,9 @@ class Judge(Walk):
 
     def judgement(self) -> Judgement:
         """Return the result so far."""
-        status, evaluation, end = self.pipeline.status(), self.evaluation, self._end
+        status = self.pipeline.status()
+        evaluation = self.evaluation
+        end = self._end
         delays = zip(status.units, status.delays, status.delay_std, strict=False)
         levels = (status.protection_level, status.protection_level_after_loss)
         far = [one.name for one in status.channels if status.is_far(one)]
@@ -259,7 +263,8 @@ class Judge(Walk):
             us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),
             rate=self._rate_health(),
         )
-        story, episodes = _joined([one.story(end) for one in self._recorders]), []
+        story = _joined([one.story(end) for one in self._recorders])
+        episodes = []
         for one in story.episodes:
             known = [
                 followed.fault
@@ -313,15 +318,16 @@ class Judge(Walk):
         for i, status in enumerate(statuses):
             changes = [one for one in evaluation.events if one.channel == status.name]
             before = [one for one in changes if one.at_s <= end]
-            state, since, reason = status.state.name, None, status.reason.value
+            state = status.state.name
+            since = None
+            reason = status.reason.value
             if before:
-                state, since, reason = (
-                    before[-1].state,
-                    before[-1].at_s,
-                    before[-1].reason,
-                )
+                state = before[-1].state
+                since = before[-1].at_s
+                reason = before[-1].reason
             elif changes:
-                state, reason = changes[0].before, ""
+                state = changes[0].before
+                reason = ""
             delivered = float(finite_values[i]) / samples
             unchecked = float(evaluation.unchecked[i])
             yield ChannelResult(
@@ -485,11 +491,13 @@ def replay(
         If recording, settings or faults do not fit, or no settings are given and none can be
         assumed.
     """
-    bag, begun = Path(path), clock()
+    bag = Path(path)
+    begun = clock()
     unused: tuple[tuple[str, str], ...] = ()
     if config is None:
         assumed = assumed_config(bag)
-        settings, unused = assumed.config, assumed.unused
+        settings = assumed.config
+        unused = assumed.unused
     else:
         settings = Config.of(config)
     deliveries = Deliveries(len(settings.topics), start)

@@ -191,7 +191,8 @@ class Baseline:
     @property
     def note(self) -> str:
         """Why no sample was judged, or why checking is limited at the end. Empty: neither."""
-        monitor, samples = self.judgement.monitor, self.judgement.scores.samples
+        monitor = self.judgement.monitor
+        samples = self.judgement.scores.samples
         if monitor.note or self.judged:
             return monitor.note
         if monitor.bias.state == "learning":
@@ -290,14 +291,17 @@ def onsets_of(
     lead: int = LEAD,
 ) -> Iterator[Onset]:
     """Replay a recording without faults up to each time, s. Times increase and lie in no gap."""
-    walk, done = Walk(pipeline), 0
+    walk = Walk(pipeline)
+    done = 0
     for at in times:
         rows = _rows_at(block, at, watch)
         walk.take(block[done : rows.start])
-        done, first = rows.start, max(0, rows.start - lead)
+        done = rows.start
+        first = max(0, rows.start - lead)
         cores = [half.core.copy() for half in pipeline.halves]
         states = [_memory_of(detector) for detector in _detectors(pipeline)]
-        part, row = block[first : rows.stop], rows.start - first
+        part = block[first : rows.stop]
+        row = rows.start - first
         yield Onset(at, int(block.stamp[0]), cores, states, pipeline.felt, part, row)
 
 
@@ -341,12 +345,11 @@ def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[T
     """Inject each fault separately into one channel at one time."""
     pipeline = monitor_of(config)
     pipeline.sense(onset.felt)
-    name, stamp = pipeline.channel_names[channel], onset.block.stamp[onset.row :]
+    name = pipeline.channel_names[channel]
+    stamp = onset.block.stamp[onset.row :]
     # Times count from the first faulty sample.
-    since, start = (
-        np.asarray((stamp - stamp[0]) * 1e-9),
-        float((stamp[0] - onset.origin) * 1e-9),
-    )
+    since = np.asarray((stamp - stamp[0]) * 1e-9)
+    start = float((stamp[0] - onset.origin) * 1e-9)
     trials = []
     struck = FORCES if channel >= pipeline.geometry.n else GYROS
     for swept in plan.faults:
@@ -493,7 +496,8 @@ def _watch(one: Subject) -> None:
             # The monitor may have been built for another recording.
             pipeline.sense(felt_units(one.block))
         one.block = pipeline.arranged(one.block)
-        one.felt, one.channels = pipeline.felt, pipeline.channel_names
+        one.felt = pipeline.felt
+        one.channels = pipeline.channel_names
         one.baseline = watch_baseline(pipeline, one.block)
         one.refused = (
             ""
@@ -509,10 +513,8 @@ def _times(baselines: Sequence[Baseline], block: Block, plan: Plan) -> list[floa
 
     `FaultError` if this part is too short for a fault.
     """
-    begins, end = (
-        max(one.begins for one in baselines),
-        min(one.duration for one in baselines),
-    )
+    begins = max(one.begins for one in baselines)
+    end = min(one.duration for one in baselines)
     seconds = _seconds(block)
     spans = (
         (float(seconds[rows.start]), float(seconds[rows.stop - 1]))

@@ -101,10 +101,8 @@ def lines_of(tried: Subject, plan: Plan, channel: int | None = None) -> list[Lin
             for one in scored
             if one.outcome in (OutcomeKind.ISOLATED, OutcomeKind.AMBIGUOUS)
         ]
-        named, found = (
-            [one.isolated_after for one in good],
-            [one.detected_after for one in good],
-        )
+        named = [one.isolated_after for one in good]
+        found = [one.detected_after for one in good]
         delays = (
             _quantiles(after, len(scored), plan.within) for after in (named, found)
         )
@@ -165,7 +163,8 @@ def sweep_figures(results: Sequence[Subject], plan: Plan, bag: str) -> dict[str,
 
 
 def _monitor_figures(tried: Subject, plan: Plan) -> dict[str, Any]:
-    lines, baseline = lines_of(tried, plan), tried.baseline
+    lines = lines_of(tried, plan)
+    baseline = tried.baseline
     return {
         "name": tried.name,
         "detector": tried.config.detector.name,
@@ -333,7 +332,8 @@ def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
     """Return the smallest size of each kind that is found, in words."""
     if not tried.trials:
         return []
-    lines, words = lines_of(tried, plan), []
+    lines = lines_of(tried, plan)
+    words = []
     for family, own in _families(lines).items():
         words.append(
             f"{family}: detected {_from(own, named=False)}; isolated {_from(own, named=True)}"
@@ -347,7 +347,8 @@ def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
         f" {false} of {len(tried.trials)} faults"
     )
     # At rest smaller faults are found than in flight.
-    moving, times = sum(speed > MOVES for speed in tried.speeds), len(tried.times)
+    moving = sum(speed > MOVES for speed in tried.speeds)
+    times = len(tried.times)
     motion = (
         f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
     )
@@ -359,7 +360,8 @@ def _from(lines: Sequence[Line], named: bool) -> str:
     """Return the smallest size that is found, with the interval of its share."""
     found = _smallest(lines, named)
     line = found or lines[-1]
-    count, size = line.count(named), f"{line.swept.size:g} {line.swept.unit}".rstrip()
+    count = line.count(named)
+    size = f"{line.swept.size:g} {line.swept.unit}".rstrip()
     interval = share(count, line.trials)
     of = f"({count} of {line.trials}, {interval.low:.0%} to {interval.high:.0%})"
     return (
@@ -479,7 +481,8 @@ def _curves(tried: Sequence[Subject], plan: Plan) -> list[Section]:
         ("median", "solid", lambda line: line.found_after.median),
         ("95 %", "dash", lambda line: line.found_after.p95),
     ]
-    families, sections = Counter(swept.family for swept in plan.faults), []
+    families = Counter(swept.family for swept in plan.faults)
+    sections = []
     for family in [
         name for name, sizes in families.items() if sizes >= LEAST_SIZES and tried
     ]:
@@ -517,7 +520,8 @@ def _figure(
     yaxis: dict[str, Any],
 ) -> Figure:
     """Draw the curves of each monitor over the size of the faults."""
-    alone, unit = len(monitors) == 1, next(iter(monitors.values()))[0].swept.unit
+    alone = len(monitors) == 1
+    unit = next(iter(monitors.values()))[0].swept.unit
     data = [
         {
             "type": "scatter",

@@ -76,7 +76,8 @@ def faulty_episodes(judgement: Judgement) -> list[Episode]:
 
 def unjudged_words(judgement: Judgement) -> str:
     """Return why the recording as a whole was not judged. Empty: it was judged."""
-    scores, bias = judgement.scores, judgement.monitor.bias
+    scores = judgement.scores
+    bias = judgement.monitor.bias
     if scores.samples_judged == 0:
         return (
             f"none of {scores.samples} samples was judged (start-up bias: {bias.state})"
@@ -267,7 +268,8 @@ def _size(size: Size, unit: Unit) -> str:
 
 def _rate(value: float, std: float, unit: Unit) -> str:
     """Format a rate with the digits that its standard error allows, at most three."""
-    size, error = abs(value) * unit.factor, std * unit.factor
+    size = abs(value) * unit.factor
+    error = std * unit.factor
     figures = 2 - math.floor(math.log10(size)) if size > 0.0 else 0
     if error > 0.0 and math.isfinite(error):
         figures = min(figures, -math.floor(math.log10(error)))

@@ -117,7 +117,8 @@ def _unchecked_lines(summary: Summary) -> list[str]:
 
 def notes(summary: Summary) -> list[str]:
     """Return notes on damage, unused messages and limits of the monitor."""
-    stream, scores = summary.stream, summary.scores
+    stream = summary.stream
+    scores = summary.scores
     lines = [*stream.damage, *sample_rate_notes(stream.sample_rate)]
     lines += [
         f"{topic}: malformed messages: {count}"
@@ -173,7 +174,8 @@ def _detection_words(fault: Outcome) -> str:
 
 def _unexplained_lines(summary: Summary, unit: Unit) -> list[str]:
     """Describe declarations that no injected fault explains."""
-    scores, story = summary.scores, summary.story
+    scores = summary.scores
+    story = summary.story
     unexplained = [one for one in story.declared if not one.injected]
     if unexplained:
         count = f"{len(unexplained)} episode{'s' if len(unexplained) > 1 else ''}"
@@ -231,7 +233,8 @@ def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
 
 def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
     """Lay out the health of each unit, the worst of its channels in each column."""
-    channels, units = summary.monitor.channels, summary.monitor.units
+    channels = summary.monitor.channels
+    units = summary.monitor.units
     rows = [
         (one, [each for each in channels if each.unit == one.name] or list(channels))
         for one in units

@@ -130,7 +130,8 @@ def figures_of(columns: Iterable[Column]) -> list[dict[str, Any]]:
 
 def told(columns: Iterable[Column], unit: Unit = RADIANS) -> Rows:
     """Lay out a row for each item, for people, with the given unit in the heads."""
-    shown_ones, cells = [column for column in columns if column.heads], []
+    shown_ones = [column for column in columns if column.heads]
+    cells = []
     for column in shown_ones:
         say = column.say if callable(column.say) else f"{{:{column.say}}}".format
         for values in (
@@ -427,10 +428,8 @@ def _section(section: Section, number: int) -> list[str]:
     ]
     # On paper the title stays with the first plot.
     first = f'<div class="keep">{head}<div class="legend"></div>{places[0]}</div>'
-    begin, end = (
-        f'<section id="{_anchor(section)}" class="plots">{first}',
-        f"{html_of(section.content)}</section>",
-    )
+    begin = f'<section id="{_anchor(section)}" class="plots">{first}'
+    end = f"{html_of(section.content)}</section>"
     return [begin, *places[1:], end]
 
 
@@ -521,8 +520,12 @@ class PageStore:
                 time[: whole : self.width], values[:whole], values[:whole], self.width
             )
         while len(self._time) > (self._most if self.width == 1 else self._most // 2):
-            time, low, high = self._time, self._low, self._high
-            self._time, self._low, self._high = time[:0], low[:0], high[:0]
+            time = self._time
+            low = self._low
+            high = self._high
+            self._time = time[:0]
+            self._low = low[:0]
+            self._high = high[:0]
             even = len(time) // 2 * 2
             self._store(time[:even:2], low[:even], high[:even], 2)
             self._store(time[even:], low[even:], high[even:], 1)
@@ -531,10 +534,8 @@ class PageStore:
     def _store(self, time: Array, low: Array, high: Array, together: int) -> None:
         low, high = _extremes(low, high, together)
         self._time = np.concatenate([self._time, time])
-        self._low, self._high = (
-            np.vstack([self._low, low]),
-            np.vstack([self._high, high]),
-        )
+        self._low = np.vstack([self._low, low])
+        self._high = np.vstack([self._high, high])
 
     def spans(self) -> tuple[Array, Array, Array]:
         """Return the spans: time of the first sample (k,), smallest and largest values (k, c)."""

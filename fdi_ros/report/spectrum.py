@@ -33,13 +33,12 @@ class Spectrum:
     """Amplitude density of n channels, averaged over a stream of ``rate`` samples per second."""
 
     def __init__(self, names: Sequence[str], rate: float) -> None:
-        self._names, self._rate = names, rate
+        self._names = names
+        self._rate = rate
         self._waiting = np.empty((0, len(names)))
         """Samples that are not averaged yet, all of the same channels, and half a piece that is."""
-        self._power, self._weight = (
-            np.zeros((PIECE // 2 + 1, len(names))),
-            np.zeros(len(names)),
-        )
+        self._power = np.zeros((PIECE // 2 + 1, len(names)))
+        self._weight = np.zeros(len(names))
 
     def add(self, values: Array) -> None:
         """Add samples (N, n), rad/s. A new piece begins if a channel disappears or returns."""
@@ -104,7 +103,8 @@ class Spectrum:
         from scipy.ndimage import median_filter
         from scipy.signal import find_peaks
 
-        half, step = self._rate / 2, self._rate / PIECE
+        half = self._rate / 2
+        step = self._rate / PIECE
         around = median_filter(density, size=(AROUND, 1), mode="nearest")
         peaks, about = find_peaks((density / around).max(axis=1), height=STANDS_OUT)
         found = [

@@ -124,7 +124,8 @@ class InjectorNode(CheckedNode):
 
     def _strike(self, k: int, data: bytes) -> bytes | None:
         """Return the message with the faults, None if a fault drops the message."""
-        n, m = self._n, len(self._names) - self._n
+        n = self._n
+        m = len(self._names) - self._n
         gyros, felt = brought = self._source.brought(k, n, m)
         measured, values = self._source.parse(data, brought.size)
         stamp = measured if self._source.stamped else self.get_clock().now().nanoseconds
@@ -133,15 +134,18 @@ class InjectorNode(CheckedNode):
         self._injectors[k].start_stamp = self._origin
 
         def block(size: int, own: slice, given: Sequence[float]) -> Block:
-            z, received = np.full((1, size), np.nan), np.zeros((1, size), dtype=bool)
-            z[0, own], received[0, own] = given, True
+            z = np.full((1, size), np.nan)
+            received = np.zeros((1, size), dtype=bool)
+            z[0, own] = given
+            received[0, own] = True
             return Block(np.array([stamp], dtype=np.int64), z, received)
 
         width = gyros.stop - gyros.start
         force = block(m, felt, values[width:]) if m else None
         whole = replace(block(n, gyros, values[:width]), acceleration=force)
         out = self._injectors[k].apply(whole)
-        after, judged = out.z[0, gyros].tolist(), out.delivered[0, gyros]
+        after = out.z[0, gyros].tolist()
+        judged = out.delivered[0, gyros]
         if out.acceleration is not None and not width:
             judged = out.acceleration.delivered[0, felt]
         if out.acceleration is not None and not np.isnan(values[width:]).all():

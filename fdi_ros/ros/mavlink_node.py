@@ -82,7 +82,8 @@ class AutopilotNode(CheckedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("mavlink_node", MAVLINK, subscribes=False, **options)
-        params, config = self.values(), self.config
+        params = self.values()
+        config = self.config
         settings = self._settings(params)
         self._link = open_link(params["url"])
         self._vehicle = Vehicle(settings, self._link.send, time.time)
@@ -267,7 +268,8 @@ class AutopilotNode(CheckedNode):
 
     def _on_diagnostics(self, data: bytes) -> None:
         self._called = True
-        now, failover = time.monotonic_ns(), self._failover
+        now = time.monotonic_ns()
+        failover = self._failover
         # All nodes publish here. Decode only messages that name the monitor.
         if len(data) > _LARGEST or f"{self._monitor}: ".encode() not in data:
             return
@@ -313,7 +315,8 @@ class AutopilotNode(CheckedNode):
     def _on_integrity(self, data: bytes) -> None:
         self._called = True
         assert self._failover is not None
-        now, count = time.monotonic_ns(), len(self.config.channel_names)
+        now = time.monotonic_ns()
+        count = len(self.config.channel_names)
         # Accelerometers follow the gyros and the stamp, and are not used.
         announced = ChannelsSource.announced(*as_batch(data))
         _, values = ChannelsSource.parse(data, max(announced, count + 7))
@@ -338,7 +341,8 @@ class AutopilotNode(CheckedNode):
     def _report(self) -> None:
         self._called = True
         self.log.begin_period()
-        now, hardware = time.monotonic_ns(), self.config.hardware_id
+        now = time.monotonic_ns()
+        hardware = self.config.hardware_id
         self._ahead = system_ahead()
         lines = self._reporter.lines(self.prefix, hardware, now)
         if self._failover is not None:

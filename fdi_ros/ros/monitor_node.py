@@ -257,15 +257,11 @@ class MonitorNode(CheckedNode, LifecycleNode):
     def _on_reset(
         self, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        response.success, response.message = (
-            self._receiver is not None,
-            "not configured",
-        )
+        response.success = self._receiver is not None
+        response.message = "not configured"
         if self._receiver is not None:
-            pipeline, declared = (
-                self._receiver.pipeline,
-                (ChannelState.FAULTY, ChannelState.AMBIGUOUS),
-            )
+            pipeline = self._receiver.pipeline
+            declared = (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
             names = [c.name for c in pipeline.status().channels if c.state in declared]
             pipeline.reset()
             response.message = f"cleared: {', '.join(names) or 'nothing was declared'}"

@@ -113,7 +113,8 @@ class BoundedLog(logging.Handler):
         self, logger: Any, clock: Callable[[], float] = time.monotonic
     ) -> None:
         super().__init__()
-        self._logger, self._clock = logger, clock
+        self._logger = logger
+        self._clock = clock
         self._since = clock()
         self._lines: Counter[str] = Counter()
         self._left_out = 0
@@ -139,7 +140,9 @@ class BoundedLog(logging.Handler):
         now = self._clock()
         if now - self._since < REPORT_PERIOD:
             return
-        left_out, self._since, self._left_out = self._left_out, now, 0
+        left_out = self._left_out
+        self._since = now
+        self._left_out = 0
         self._lines.clear()
         if left_out:
             self._lines["warning"] = 1
@@ -159,7 +162,8 @@ class BoundedLog(logging.Handler):
     def take_over(self) -> None:
         """Take what the package logs, which then goes nowhere else."""
         package = logging.getLogger("fdi_ros")
-        package.handlers, package.propagate = [self], False
+        package.handlers = [self]
+        package.propagate = False
 
 
 class InputQueue:
@@ -202,12 +206,15 @@ class InputQueue:
         """Close all subscriptions."""
         for one in self.subscriptions:
             self._node.destroy_subscription(one)
-        self.subscriptions, self.flooded, self._waiting = {}, False, 0
+        self.subscriptions = {}
+        self.flooded = False
+        self._waiting = 0
 
     def drain(self) -> None:
         """Take waiting messages in the order of their arrival, for `LONGEST` or two full queues at most."""
         takers = list(self.subscriptions.items())
-        taken, end = 0, time.monotonic() + LONGEST
+        taken = 0
+        end = time.monotonic() + LONGEST
         heads = [_next(one) for one, _ in takers]
         while waiting := [
             (head[0], k, head[1]) for k, head in enumerate(heads) if head is not None
@@ -231,11 +238,13 @@ class InputQueue:
             self._waiting -= 1
         self._taken, now = 0, time.monotonic()
         if not self.flooded and self._waiting > FLOOD:
-            self.flooded, self._until = True, now + FLOOD_TIME
+            self.flooded = True
+            self._until = now + FLOOD_TIME
             words = "flooded with messages: inputs are polled while it lasts"
             self._node.get_logger().warning(words, throttle_duration_sec=10.0)
         elif self.flooded and now >= self._until:
-            self.flooded, self._waiting = False, 0
+            self.flooded = False
+            self._waiting = 0
 
 
 def _next(subscription: Subscription[Any]) -> tuple[int, bytes] | None:
@@ -391,7 +400,8 @@ class CheckedNode(Node):
                 raise ConfigError(
                     f"unknown QoS override {name!r}, expected one of: {', '.join(known) or 'none'}"
                 )
-            value, choices = given[name], known[name]
+            value = given[name]
+            choices = known[name]
             if choices and value not in choices:
                 raise ConfigError(
                     f"{name} is {value!r}, expected one of: {', '.join(choices)}"
@@ -456,7 +466,8 @@ class CheckedNode(Node):
             return type(response)()
 
     def _on_set_parameters(self, request: Any, response: Any) -> Any:
-        given, results = request.parameters, []
+        given = request.parameters
+        results = []
         together = isinstance(request, SetParametersAtomically.Request)
         for k, messages in enumerate([given] if together else [[one] for one in given]):
             self.keep_up()
@@ -509,7 +520,8 @@ _TYPES = {
 
 def _typed(parameter: Parameter, field: Field) -> Parameter:
     """Return a parameter in the type of its field, or unchanged if no equal value of that type exists."""
-    value, kind = parameter.value, _TYPES[field.kind]
+    value = parameter.value
+    kind = _TYPES[field.kind]
     is_list = isinstance(value, Sequence) and not isinstance(value, str | bytes)
     if hasattr(value, "tolist"):
         value = value.tolist()

@@ -69,7 +69,8 @@ class PlayerNode(CheckedNode):
     def _on_pause(
         self, pause: bool, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        response.success, response.message = True, "paused" if pause else "playing"
+        response.success = True
+        response.message = "paused" if pause else "playing"
         if pause != self._paused:
             self.log.info(response.message)
         self._paused = pause
@@ -122,7 +123,8 @@ class PlayerNode(CheckedNode):
                 # Counted from the first message that is ready, as reading takes a while.
                 start = answered = now
             while True:
-                ahead, paused = start + due / self._rate - now, self._paused
+                ahead = start + due / self._rate - now
+                paused = self._paused
                 # What was late, as a chunk was read, is not made up for in a burst that
                 # no queue holds.
                 start += max(0.0, -ahead - MOST_BEHIND)

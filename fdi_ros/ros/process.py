@@ -59,7 +59,8 @@ def spin(node: Any, stop: Stop) -> None:
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
-    executor, flooded = make_executor(node), False
+    executor = make_executor(node)
+    flooded = False
     single = isinstance(executor, SingleThreadedExecutor)
     # Objects that exist now stay: the garbage collector need not visit them again.
     gc.collect()

@@ -86,7 +86,9 @@ class ChangeLog:
         names: Sequence[str],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._log, self._names, self._clock = log, names, clock
+        self._log = log
+        self._names = names
+        self._clock = clock
         self._last = [_Line() for _ in names]
 
     def grow(self, names: Sequence[str]) -> None:
@@ -108,7 +110,8 @@ class ChangeLog:
             if now < last.until and BY_SEVERITY.index(
                 event.after.name
             ) <= BY_SEVERITY.index(last.state.name):
-                last.left_out, last.present = last.left_out + 1, event.after
+                last.left_out = last.left_out + 1
+                last.present = event.after
                 continue
             words = format_reason(event, self._names)
             words += f"; {pair}" if pair is not None and len(event.group) > 1 else ""
@@ -151,7 +154,8 @@ class InputTopic:
 
     def __init__(self, receiver: Receiver, number: int, topic: str) -> None:
         self.topic = topic
-        self._receiver, self._number = receiver, number
+        self._receiver = receiver
+        self._number = number
         self._inlet = receiver.live["inlets"][0, number]
         self._name = receiver.source.names[number]
         self._watchdog = Watchdog(round(receiver.source.timeout * 1e9))
@@ -172,11 +176,9 @@ class InputTopic:
 
     def status(self, now: int) -> InputStatus:
         """Describe the topic at the clock time now, ns."""
-        counts, receiver, watchdog = (
-            self._receiver.counts(self._number),
-            self._receiver,
-            self._watchdog,
-        )
+        counts = self._receiver.counts(self._number)
+        receiver = self._receiver
+        watchdog = self._watchdog
         received, stamp, lag = (
             int(self._inlet[name]) for name in ("received", "stamp", "lag")
         )
@@ -246,7 +248,8 @@ class InputTopic:
         self, node: CheckedNode, inputs: Sequence[InputTopic], log: BoundedLog
     ) -> None:
         """Log when the topic gets a second publisher, or when an earlier input reads the same topic."""
-        before, self._sources = self._sources, ""
+        before = self._sources
+        self._sources = ""
         first = next(one for one in inputs if one.topic == self.topic)
         if first is not self:
             self._sources = (
@@ -277,7 +280,8 @@ class Running:
     def __init__(
         self, node: CheckedNode, receiver: Receiver, state_file: StateFile | None
     ) -> None:
-        self._node, self._state_file = node, state_file
+        self._node = node
+        self._state_file = state_file
         self._outputs = {
             output: node.create_output(
                 output.topic.type, output.topic.name, **OVERRIDABLE
@@ -328,7 +332,8 @@ class Running:
 
     def _take(self, inlet: int, data: bytes) -> None:
         """Take in a message, and publish the results of all samples that the message completes."""
-        begun, receiver = time.perf_counter_ns(), self.receiver
+        begun = time.perf_counter_ns()
+        receiver = self.receiver
         self.topics[inlet].last = data
         # The clock of a simulator may have any time: what the header of a message
         # cannot hold is its end.
@@ -378,7 +383,8 @@ class Running:
     def check(self) -> None:
         """Check for changes. Call this many times in each period of the reports."""
         self._count_subscribers()
-        now, log = self._now(), self._node.log
+        now = self._now()
+        log = self._node.log
         self._check_clock()
         is_open = bool(self._node.inputs.subscriptions)
         changes = [topic.check(now, log) for topic in self.topics] if is_open else []
@@ -477,7 +483,8 @@ class Running:
 
     def _check_bias(self) -> None:
         """Log where the biases come from, and why not from a time at rest, whenever that changes."""
-        pipeline, log = self.receiver.pipeline, self._node.log
+        pipeline = self.receiver.pipeline
+        log = self._node.log
         outcome = int(pipeline.core["bias"]["outcome"][0])
         if outcome != self._bias_outcome and self._samples:
             self._bias_outcome = outcome
@@ -502,7 +509,8 @@ class Running:
     def _report(self) -> None:
         """Publish the diagnostics."""
         self._learn_channels()
-        clock, now = self._node.get_clock().now().nanoseconds, self._now()
+        clock = self._node.get_clock().now().nanoseconds
+        now = self._now()
         prefix = self._node.prefix
         if not self._node.inputs.subscriptions:
             hardware = self.receiver.pipeline.config.hardware_id

@@ -121,10 +121,8 @@ class Picture:
         """Keep the present channels and remember which changed state."""
         moves: dict[tuple[Level, str], list[str]] = {}
         for name, line in channels.items():
-            before, state = (
-                self.channels[name].value("state") if name in self.channels else "",
-                line.value("state"),
-            )
+            before = self.channels[name].value("state") if name in self.channels else ""
+            state = line.value("state")
             if state != before:
                 why = f": {line.message}" if state != "OK" and line.message else ""
                 words = f"{before} -> {state}{why}" if before else f"{state}{why}"
@@ -155,7 +153,8 @@ class Watcher(Node):
     def look(self) -> None:
         """Look for a monitor and listen. Raise `FdiError` if several run and none is named."""
         picture = self.picture
-        before, picture.monitor = picture.waiting, picture.monitor or self._choose()
+        before = picture.waiting
+        picture.monitor = picture.monitor or self._choose()
         if picture.monitor:
             picture.waiting = self._listen(picture.monitor)
         else:
@@ -237,7 +236,8 @@ class Watcher(Node):
             self.picture.heard["fused"] = time.monotonic()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        found, picture = [], self.picture
+        found = []
+        picture = self.picture
         with contextlib.suppress(ValueError):
             found = read_diagnostics(message, picture.monitor)
         channels = {line.name: line for line in found if line.value("state")}
@@ -318,16 +318,15 @@ class LineReport:
 
     def lines(self) -> list[str]:
         """Return new lines since the last call, and take their changes out of the picture."""
-        picture, now, caption, before = (
-            self._picture,
-            time.time(),
-            self._caption,
-            self._said,
-        )
+        picture = self._picture
+        now = time.time()
+        caption = self._caption
+        before = self._said
         whole = picture.waiting or (
             "" if picture.is_silent("diagnostics") else picture.verdict
         )
-        self._caption, self._said = picture.caption, whole
+        self._caption = picture.caption
+        self._said = whole
         lines = [(now, picture.caption)] if picture.caption != caption else []
         lines += [(change.at, change.words) for change in picture.changes]
         picture.changes.clear()
@@ -346,7 +345,8 @@ class LineReport:
 
 
 def _format_figures(picture: Picture) -> str:
-    rate, evidence = "no fused rate", "nothing judged"
+    rate = "no fused rate"
+    evidence = "nothing judged"
     if picture.rate is not None and not picture.is_silent("fused"):
         rate = f"fused rate{''.join(f' {value:+.3f}' for value in picture.rate)} rad/s"
     if picture.evidence is not None:
@@ -476,7 +476,8 @@ def _channel_table(picture: Picture, is_wide: bool) -> Table:
 
     Gyros come first, then accelerometers, each with a scale in their own unit.
     """
-    is_fresh, columns = not picture.is_silent("diagnostics"), 5 if is_wide else 4
+    is_fresh = not picture.is_silent("diagnostics")
+    columns = 5 if is_wide else 4
     longest = max(len(shown(name)) for name in picture.channels)
     table = _grid((longest, 9, None, 9, 18)[:columns])
     for unit in (RATE.unit, FORCE.unit):
@@ -528,7 +529,8 @@ def _channel_rows(
             "none",
         ]
         if is_fresh:
-            colour, residual = COLOURS[line.level], residuals[name]
+            colour = COLOURS[line.level]
+            residual = residuals[name]
             bar = Bar(
                 scale, 0.0, min(sizes[name], scale), color=colour.removeprefix("bold ")
             )
@@ -539,7 +541,8 @@ def _channel_rows(
 
 
 def _format_bias(line: StatusLine, unit: str) -> str:
-    bias, std = line.number(f"bias ({unit})"), line.number(f"bias known to ({unit})")
+    bias = line.number(f"bias ({unit})")
+    std = line.number(f"bias known to ({unit})")
     known = f" +- {std:.4f}" if math.isfinite(std) else ""
     return f"{bias:+.4f}{known}" if math.isfinite(bias) else "none"
 

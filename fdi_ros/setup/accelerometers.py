@@ -109,7 +109,8 @@ def prepare_accelerometers(
     whole, felt = (accelerometer_names(config, which) for which in (everywhere, units))
     names = tuple(name for name in felt if name not in config.excluded_channels)
     active = np.array([whole.index(name) for name in names])
-    axes, force = nominal_axes(config)[active], block.acceleration
+    axes = nominal_axes(config)[active]
+    force = block.acceleration
     most = np.broadcast_to(config.accelerometers.max_acceleration, len(whole))[active]
     delivered = force.delivered[:, active]
     data = prepare(Block(force.stamp, force.z[:, active], delivered), most)
@@ -154,7 +155,8 @@ def _added(
     added = np.zeros_like(data.z)
     if not arms.any():
         return added
-    turning, seconds = np.nan_to_num(turning_of(gyros)[0]), gyros.blocks.seconds
+    turning = np.nan_to_num(turning_of(gyros)[0])
+    seconds = gyros.blocks.seconds
     along = np.einsum("bac,nc,na->bn", turning, arms, axes)
     for i, values in enumerate(along.T):
         added[:, i] = np.interp(data.seconds - delay[i], seconds, values)
@@ -222,7 +224,8 @@ def fit_accelerometers(
 
     ``without`` leaves out the samples of the ``faults``, which were declared.
     """
-    data, names = without(ready.data, ready.names), ready.names
+    data = without(ready.data, ready.names)
+    names = ready.names
     found = estimate(data, ready.priors)
     return AccelerometerFit(
         names=names,
@@ -236,7 +239,9 @@ def fit_accelerometers(
 
 def _scaled(found: StateEstimate) -> StateEstimate:
     """Return the estimate in m/s^2."""
-    size, floor, walk = FORCE.natural, found.floor, found.bias_walk
+    size = FORCE.natural
+    floor = found.floor
+    walk = found.bias_walk
     return replace(
         found,
         bias=found.bias * size,
@@ -269,7 +274,8 @@ def _differences(found: StateEstimate, nominal: Array) -> StateEstimate:
 
 def _settings(config: Config, active: Int, found: StateEstimate) -> dict[str, object]:
     """Return the changed parameters."""
-    own, n = config.accelerometers, 3 * len(config.topics)
+    own = config.accelerometers
+    n = 3 * len(config.topics)
 
     def changed(before: Sequence[float], new: Array | float) -> list[float]:
         """Replace the values of the channels in use, and give them back with 4 digits."""
@@ -277,7 +283,8 @@ def _settings(config: Config, active: Int, found: StateEstimate) -> dict[str, ob
         values[active] = new
         return [float(f"{value:.4g}") + 0.0 for value in values]
 
-    std, moving = found.floor.std, found.moment[~found.rest]
+    std = found.floor.std
+    moving = found.moment[~found.rest]
     if len(moving):
         std = np.maximum(std, np.median(moving, axis=0) / LOUDER)
     axes = nominal_axes(config)

@@ -77,7 +77,8 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
     moving = np.median(turning, axis=0) >= LEAST_ROTATION
     if moving.sum() < LEAST_WINDOWS:
         return
-    turning, means = np.maximum(turning[:, moving], 1e-9), means[moving]
+    turning = np.maximum(turning[:, moving], 1e-9)
+    means = means[moving]
     ratio = np.median(turning[:, None] / turning[None], axis=2)
     # Along the directions in which each unit turns most to least: one bad axis is not the scale of the unit.
     along = np.sqrt(
@@ -106,11 +107,9 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
         nominal.channel_names[unit[0]].rpartition(".")[0] or "one triad"
         for unit in units
     ]
-    name, others, mend = (
-        names[odd],
-        " and ".join(names[k] for k in most),
-        "or name its channels in excluded_channels",
-    )
+    name = names[odd]
+    others = " and ".join(names[k] for k in most)
+    mend = "or name its channels in excluded_channels"
     if alike[odd, most].all():
         doubt = (
             ""
@@ -198,7 +197,8 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
     ``square``: mean products (n, n) of the channels, (rad/s)^2. Empty unless all
     contradict.
     """
-    size, found = float(np.sqrt(square[i, i])), []
+    size = float(np.sqrt(square[i, i]))
+    found = []
     for three in map(
         list, itertools.combinations([j for j in range(len(axes)) if j != i], 3)
     ):
@@ -287,12 +287,11 @@ def _against(first: Array, unit: Array) -> Mount:
         return Mount(
             "NOT KNOWN: it and the first unit share no rotation about two axes"
         )
-    power, square = (
-        max(float((first**2).sum()), 1e-30),
-        (first - unit @ rotation.T) ** 2,
-    )
+    power = max(float((first**2).sum()), 1e-30)
+    square = (first - unit @ rotation.T) ** 2
     missed = float(square.sum()) / power
-    shared, error = 1.0 - missed, math.sqrt(float(np.mean(square)) * uncertainty)
+    shared = 1.0 - missed
+    error = math.sqrt(float(np.mean(square)) * uncertainty)
     if shared < SAME < 1.0 - float(((first - unit @ mirrored.T) ** 2).sum()) / power:
         return Mount(
             "NOT KNOWN: mirrored relative to the first unit",

@@ -71,7 +71,8 @@ class Data:
 
 def prepare(block: Block, max_rate: Array) -> Data:
     """Mark unusable values: missing, not finite, beyond max_rate (n,), rad/s, or repeated."""
-    received, finite = block.delivered, np.isfinite(block.z)
+    received = block.delivered
+    finite = np.isfinite(block.z)
     with np.errstate(invalid="ignore"):
         inside = np.abs(block.z) < max_rate
     data = Data(block.stamp, np.where(received & inside, block.z, np.nan), {})
@@ -95,7 +96,8 @@ def spikes(z: Array, axes: Array) -> Mask:
 
     ``axes``: (n, 3).
     """
-    found, apart = np.zeros(z.shape, dtype=bool), projector(axes)
+    found = np.zeros(z.shape, dtype=bool)
+    apart = projector(axes)
     # Vibration changes the usual size.
     for first in range(0, max(len(z) - 2, 0), SPIKE_PORTION):
         part = z[first : first + SPIKE_PORTION + 2]
@@ -170,10 +172,8 @@ def make_blocks(data: Data, delay: Array) -> Blocks:
     first = np.flatnonzero(np.diff(number, prepend=-1))
     start = np.flatnonzero(np.diff(number[first] // REST_BLOCKS, prepend=-1))
     z, white = resampled(data, delay)
-    samples, used = (
-        np.full((len(start), *z.shape[1:] * 2), np.nan),
-        np.zeros(len(start), dtype=np.int64),
-    )
+    samples = np.full((len(start), *z.shape[1:] * 2), np.nan)
+    used = np.zeros(len(start), dtype=np.int64)
     for w, part in enumerate(np.split(z, first[start[1:]])):
         there = np.isfinite(part)
         columns = np.flatnonzero(there.mean(axis=0) >= PRESENT)
@@ -183,10 +183,8 @@ def make_blocks(data: Data, delay: Array) -> Blocks:
             part = part - part.mean(axis=0)
             samples[w][np.ix_(columns, columns)] = part.T @ part / (len(part) - 1)
     count = np.diff(first, append=len(z))
-    mean, seconds = (
-        np.add.reduceat(z, first, axis=0) / count[:, None],
-        np.add.reduceat(data.seconds, first) / count,
-    )
+    mean = np.add.reduceat(z, first, axis=0) / count[:, None]
+    seconds = np.add.reduceat(data.seconds, first) / count
     return Blocks(seconds, mean, start, samples, white, used)
 
 
@@ -195,12 +193,10 @@ def resampled(data: Data, delay: Array) -> tuple[Array, Array]:
 
     Returns values (N, n), rad/s, NaN if unknown, and the remaining share (n,) of white noise variance.
     """
-    seconds, there, z, white = (
-        data.seconds,
-        np.isfinite(data.z),
-        data.z.copy(),
-        np.ones(len(delay)),
-    )
+    seconds = data.seconds
+    there = np.isfinite(data.z)
+    z = data.z.copy()
+    white = np.ones(len(delay))
     left = [
         i
         for i in range(len(delay))
@@ -216,7 +212,9 @@ def resampled(data: Data, delay: Array) -> tuple[Array, Array]:
         ]
         left = [j for j in left if j not in alike]
         rows = np.flatnonzero(there[:, i])
-        knots, squares, count = seconds[rows], 0.0, 0
+        knots = seconds[rows]
+        squares = 0.0
+        count = 0
         usual = float(np.median(np.diff(knots))) if len(rows) > 1 else 0.0
         z[:, alike] = np.nan
         for begin in range(0, len(z), PORTION):
@@ -229,7 +227,8 @@ def resampled(data: Data, delay: Array) -> tuple[Array, Array]:
                 "mp,mpc->mc", weight[known], data.z[around[..., None], alike]
             )
             z[np.ix_(begin + known, np.array(alike))] = values
-            squares, count = squares + (weight[known] ** 2).sum(), count + len(known)
+            squares = squares + (weight[known] ** 2).sum()
+            count = count + len(known)
         white[alike] = squares / count if count else 1.0
     return z, white
 

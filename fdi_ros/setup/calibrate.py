@@ -159,7 +159,8 @@ def calibrate(
     used = np.array(
         [name not in config.excluded_channels for name in full.channel_names]
     )
-    active, nominal = np.flatnonzero(used), full.subset(used)
+    active = np.flatnonzero(used)
+    nominal = full.subset(used)
     chosen = reference_channels(config, nominal, reference)
     data, spiky = _prepared(block, config, used, nominal)
     lost = np.flatnonzero(np.isin(active, unknown)).tolist()
@@ -274,7 +275,8 @@ def _as_monitored(
     block: Block, data: Data, used: Mask, found: StateEstimate, beside: Prepared | None
 ) -> Block:
     """Return the samples as the monitor will have them once delays are taken off."""
-    z, received = block.z.copy(), block.delivered.copy()
+    z = block.z.copy()
+    received = block.delivered.copy()
     still = np.isfinite(data.z) & (np.abs(found.delay) < NOT_SHIFTED)
     z[:, used] = np.where(still, data.z, resampled(data, found.delay)[0])
     # The value of another instant is no substitute.
@@ -287,7 +289,8 @@ def _as_monitored(
 
 def _check_amount(data: Data, names: tuple[str, ...]) -> None:
     """Refuse a recording that is too short, too slow, or lacks too much of a channel."""
-    samples, words = len(data.stamp), ""
+    samples = len(data.stamp)
+    words = ""
     if samples < 2 or data.duration < LEAST_DURATION:
         words = f"is {data.duration:.1f} s long, a calibration needs at least {LEAST_DURATION:g} s"
     elif samples < LEAST_SAMPLES:
@@ -314,7 +317,8 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
 
 def reference_channels(config: Config, geometry: Geometry, name: str) -> list[int]:
     """Return the reference channels among those in use, empty if all are alike."""
-    names, units = geometry.channel_names, source_of(config).units
+    names = geometry.channel_names
+    units = source_of(config).units
     if not name:
         threes = map(list, itertools.combinations(range(geometry.n), 3))
         return (
@@ -344,18 +348,17 @@ def _sensors(
     config: Config, nominal: Geometry, data: Data, chosen: list[int], lost: list[int]
 ) -> Priors:
     """Return the axes as configured; arrays and unknown mounts take those of the motion."""
-    source, axes, scale = (
-        source_of(config),
-        nominal.axes.copy(),
-        np.full(nominal.n, SCALE_STD),
-    )
+    source = source_of(config)
+    axes = nominal.axes.copy()
+    scale = np.full(nominal.n, SCALE_STD)
     means = data.slow_rates()
     if not source.units and len(means) >= LEAST_WINDOWS:
         x = means[:, chosen]
         found = np.linalg.lstsq(x, means, rcond=None)[0].T @ axes[chosen]
         turns = np.sqrt(np.linalg.eigvalsh(x.T @ x / len(x))[0]) >= LEAST_ROTATION
         if turns and np.abs(found - axes).max() > UNKNOWN_AXES:
-            axes, scale = found, np.full(nominal.n, UNKNOWN_AXES)
+            axes = found
+            scale = np.full(nominal.n, UNKNOWN_AXES)
     if lost:
         # Directions without rotation stay as configured.
         others = [i for i in range(nominal.n) if i not in lost]
@@ -364,7 +367,8 @@ def _sensors(
         axes[lost] = np.linalg.solve(
             rate.T @ rate + weak, rate.T @ means[:, lost] + weak @ axes[lost].T
         ).T
-    scale[chosen], scale[lost] = REFERENCE_STD, UNKNOWN_MOUNT
+    scale[chosen] = REFERENCE_STD
+    scale[lost] = UNKNOWN_MOUNT
     # Channels that belong to no unit are of the first.
     units = list(dict.fromkeys(unit for unit in nominal.unit_of if unit)) or [""]
     unit = np.array([units.index(unit) if unit else 0 for unit in nominal.unit_of])
@@ -431,7 +435,8 @@ def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data
     clear = [
         span for span in faults if len(span.channels) <= MOST_LEFT_OUT * len(names)
     ]
-    z, share = data.z.copy(), np.zeros(len(names))
+    z = data.z.copy()
+    share = np.zeros(len(names))
     for span in clear:
         share[list(span.channels)] += (span.end - span.start) / data.duration
         rows = (data.seconds >= span.start - LEAD) & (data.seconds <= span.end)
@@ -452,7 +457,8 @@ def _settings(
 ) -> dict[str, object]:
     """Return the changed parameters, for samples every `step` s."""
     geometry = build_geometry(config)
-    before, source = build_noise(config, geometry.n), source_of(config)
+    before = build_noise(config, geometry.n)
+    source = source_of(config)
 
     def changed(values: ArrayLike, new: ArrayLike) -> Array:
         whole = np.broadcast_to(
@@ -462,7 +468,8 @@ def _settings(
         whole[active] = new
         return whole
 
-    moving, std = found.moment[~found.rest], found.floor.std
+    moving = found.moment[~found.rest]
+    std = found.floor.std
     if len(moving):
         std = np.maximum(std, np.median(moving, axis=0) / LOUDER)
     settings: dict[str, object] = {
@@ -523,7 +530,8 @@ def _nonlinearity(before: NoiseModel, active: Int, found: StateEstimate) -> Arra
 
     A recording shows the rates that were flown, and no larger ones.
     """
-    usual, shown = before.nonlinearity_std[active], found.nonlinearity
+    usual = before.nonlinearity_std[active]
+    shown = found.nonlinearity
     sure = shown.is_measured and shown.value > SHOWN * shown.error
     return np.maximum(usual, shown.value if sure else 0.0)
 

@@ -31,7 +31,8 @@ class ChannelFit:
     unusable: dict[str, Int]
 
     def __post_init__(self) -> None:
-        found, n = self.estimate, len(self.names)
+        found = self.estimate
+        n = len(self.names)
         self.axes = axes = found.axes
         """(n, 3)."""
         self.axes_std = np.sqrt(np.diag(found.axes_covariance)).reshape(-1, 3)
@@ -46,7 +47,8 @@ class ChannelFit:
         length = np.linalg.norm(axes, axis=1)
         self.factor = length / np.linalg.norm(self.nominal, axis=1)
         """(n,) scale factor relative to nominal."""
-        each, along = found.axes_covariance.reshape(n, 3, n, 3), axes / length[:, None]
+        each = found.axes_covariance.reshape(n, 3, n, 3)
+        along = axes / length[:, None]
         square = np.einsum("ia,iab,ib->i", along, each[range(n), :, range(n)], along)
         self.factor_error = np.sqrt(np.maximum(square, 0))
         """(n,) standard errors of the scale factors."""

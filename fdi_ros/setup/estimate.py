@@ -186,10 +186,13 @@ class StateEstimate:
 def estimate(data: Data, sensors: Priors) -> StateEstimate:
     """Estimate all states from a recording."""
     n = len(sensors.axes)
-    axes, biases, colour = sensors.axes.copy(), np.zeros((1, n)), np.ones((2, n))
+    axes = sensors.axes.copy()
+    biases = np.zeros((1, n))
+    colour = np.ones((2, n))
     priors = sensors
     # Delays taken off the blocks, and the largest change in the last pass.
-    taken, moved = sensors.delay.copy(), np.inf
+    taken = sensors.delay.copy()
+    moved = np.inf
     blocks = make_blocks(data, taken[sensors.unit])
     walk: RandomWalk | None = None
     for number in range(PASSES):
@@ -274,7 +277,9 @@ class _Pass:
         known: bool,
         colour: Array,
     ) -> None:
-        self.blocks, self.axes, self.window = blocks, axes, blocks.window
+        self.blocks = blocks
+        self.axes = axes
+        self.window = blocks.window
         #: number of constants that motion shows, the first of all
         self.motion = 3 * len(axes) + sensors.units - 1
         y, moment = self._noise_of_windows()
@@ -335,8 +340,10 @@ class _Pass:
 
         Blocks in motion without one are no longer used.
         """
-        blocks, rate = self.blocks, self.rate
-        acceleration, inside = np.zeros_like(rate), np.zeros(len(rate), dtype=bool)
+        blocks = self.blocks
+        rate = self.rate
+        acceleration = np.zeros_like(rate)
+        inside = np.zeros(len(rate), dtype=bool)
         span = blocks.seconds[2:] - blocks.seconds[:-2]
         inside[1:-1] = (span < 2.5 * blocks.length) & self.used[2:] & self.used[:-2]
         acceleration[1:-1] = (rate[2:] - rate[:-2]) / span[:, None]
@@ -394,11 +401,9 @@ class _Pass:
 
         Quiet, at rest for the monitor, and with one common mean.
         """
-        blocks, rate, found = (
-            self.blocks,
-            self.rate,
-            np.zeros(self.blocks.windows, dtype=bool),
-        )
+        blocks = self.blocks
+        rate = self.rate
+        found = np.zeros(self.blocks.windows, dtype=bool)
         noise = np.einsum(
             "wai,wi->wa", gain**2, np.where(variance < ABSENT, variance, 0.0)
         )
@@ -433,7 +438,9 @@ class _Pass:
         self, sensors: Priors, delay: Array, y: Array, acceleration: Array
     ) -> tuple[NormalEquations, NormalEquations]:
         """Return the evidence in blocks y (B, n), complete and without vibration."""
-        axes, variance, n = self.axes, self.variance, len(self.axes)
+        axes = self.axes
+        variance = self.variance
+        n = len(self.axes)
         coefficients, prior = coefficients_of(sensors, axes)
         moving = (~self.still[self.window])[:, None]
         base = np.hstack(
@@ -442,7 +449,8 @@ class _Pass:
         base = base * self.used[:, None]
         # In motion A H = 0. Subtracting the rate first avoids the rounding error.
         residual = (y - (self.rate * moving) @ axes.T) * self.used[:, None]
-        moments, cross = self._by_window(base, base), self._by_window(base, residual)
+        moments = self._by_window(base, base)
+        cross = self._by_window(base, residual)
         count = np.add.reduceat(self.used, self.blocks.start) * ~self.still
         moments = self._without_noise(moments, count)
         a = information(variance, axes)
@@ -482,8 +490,10 @@ class _Pass:
         ``moments`` (W, 7, 7) and ``cross`` (W, 7, n). The change of the biases is
         added as states of its own: the bias is b + (t - mean t) g.
         """
-        n, size = len(self.axes), (len(self.groups), len(flat))
-        normal, right = np.zeros((*size, len(flat))), np.zeros(size)
+        n = len(self.axes)
+        size = (len(self.groups), len(flat))
+        normal = np.zeros((*size, len(flat)))
+        right = np.zeros(size)
         for k, group in enumerate(self.groups):
             # (n, n, 7, 7): sum of the products of A and s s'.
             of_windows = a[group].reshape(-1, n * n).T
@@ -505,7 +515,8 @@ class _Pass:
         K is W count^2 min(U, s^2) in units of e^2 (docs/calibration.md, "What vibration
         explains").
         """
-        variance, moving = self.variance, ~self.rest
+        variance = self.variance
+        moving = ~self.rest
         at_rest = (
             np.median(variance[self.rest], axis=0)
             if self.rest.any()
@@ -548,7 +559,9 @@ class _Pass:
 
         The first row is at rest, the second in motion.
         """
-        blocks, n, found = self.blocks, len(axes), np.ones((2, len(axes)))
+        blocks = self.blocks
+        n = len(axes)
+        found = np.ones((2, len(axes)))
         full = self.present.all(axis=1) & (blocks.size == REST_BLOCKS)
         full &= np.logical_and.reduceat(self.used, blocks.start)
         for regime, windows in enumerate((full & self.rest, full & ~self.rest)):
@@ -596,10 +609,8 @@ def coefficients_of(sensors: Priors, axes: Array) -> tuple[Array, Array]:
     prepare_layout(layout, axes, sensors.unit, sensors.units, priors, {"bias": 0.0})
     # Each of the base alone: rates, and accelerations along the channels.
     signals = np.zeros((BASE, n, SIGNALS))
-    rates, accelerations = (
-        np.eye(BASE, 3, -1),
-        np.hstack([np.zeros((n, 4)), axes]).T.copy(),
-    )
+    rates = np.eye(BASE, 3, -1)
+    accelerations = np.hstack([np.zeros((n, 4)), axes]).T.copy()
     for k in range(BASE):
         fill_signals(layout, rates[k], accelerations[k], signals[k])
     signals[1:, :, layout["by"] == ONE] = 0.0

@@ -59,7 +59,9 @@ def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, 
     errors of a turn stay equal from sample to sample, so they add to the variance of
     the mean.
     """
-    limits, V, white = config.integrity, geometry.parity, noise.noise_std**2
+    limits = config.integrity
+    V = geometry.parity
+    white = noise.noise_std**2
     turning = (noise.scale_std * limits.max_rate) ** 2 + (
         noise.timing_std * limits.max_acceleration
     ) ** 2
@@ -147,11 +149,10 @@ class Mounting:
 def assess(config: Config) -> Mounting:
     """Assess the mounting of a configuration. `FdiError` if settings contradict each other."""
     geometry = build_geometry(config)
-    noise, probability = build_noise(config, geometry.n), alarm_probability(config)
-    smallest, waited = (
-        smallest_detectable(geometry, noise, probability),
-        waiting(config, geometry, noise),
-    )
+    noise = build_noise(config, geometry.n)
+    probability = alarm_probability(config)
+    smallest = smallest_detectable(geometry, noise, probability)
+    waited = waiting(config, geometry, noise)
     sets = [
         lost
         for count in range(3)
@@ -170,7 +171,8 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     gdop = float(np.sqrt(np.trace(np.linalg.inv(axes.T @ axes))))
     std = np.sqrt(np.diag(np.linalg.inv((axes.T / noise.noise_std[kept] ** 2) @ axes)))
     try:
-        rest, numbers = geometry.subset(kept), np.flatnonzero(kept)
+        rest = geometry.subset(kept)
+        numbers = np.flatnonzero(kept)
     except GeometryError:
         # Three channels give an unchecked rate.
         return Loss(lost, gdop, std)
@@ -232,7 +234,8 @@ def _losses(
             for one, most in zip(found, left, strict=True)
         ]
 
-    seen, isolated = named(lambda one: one.detectable), named(lambda one: one.isolable)
+    seen = named(lambda one: one.detectable)
+    isolated = named(lambda one: one.isolable)
     return [
         Column("lost", named(lambda one: one.lost), ("lost",), _or_none),
         Column(
@@ -261,7 +264,8 @@ def _or_none(names: Sequence[str]) -> str:
 
 def mounting_figures(result: Mounting) -> dict[str, object]:
     """Return all figures by name, SI units: for programs."""
-    g, names = result.geometry, result.geometry.channel_names
+    g = result.geometry
+    names = result.geometry.channel_names
     return {
         "channels": figures_of(_channels(result)),
         "false_alarm_probability": result.false_alarm_probability,
@@ -284,7 +288,9 @@ def mounting_figures(result: Mounting) -> dict[str, object]:
 
 def pair_lines(result: Mounting) -> list[str]:
     """Describe pairs of channels that look alike."""
-    g, names, lines = result.geometry, result.geometry.channel_names, []
+    g = result.geometry
+    names = result.geometry.channel_names
+    lines = []
     for i, j in result.alike:
         cosine = float(
             g.axes[i]
@@ -318,11 +324,10 @@ def _double_words(result: Mounting) -> str:
     words = f"after the loss of two channels: a rate for {len(spanning)} of {len(result.double)} pairs"
     if not spanning:
         return words
-    best, worst = spanning[0].gdop, max(spanning, key=lambda loss: loss.gdop)
-    seen, named = (
-        sum(bool(loss.detectable) for loss in spanning),
-        sum(bool(loss.isolable) for loss in spanning),
-    )
+    best = spanning[0].gdop
+    worst = max(spanning, key=lambda loss: loss.gdop)
+    seen = sum(bool(loss.detectable) for loss in spanning)
+    named = sum(bool(loss.isolable) for loss in spanning)
     return (
         f"{words}, GDOP {best:.3f} to {worst.gdop:.3f} (worst without {' and '.join(names[i] for i in worst.lost)});"
         f" a further fault of at least one channel is detected for {seen}, isolated for {named}"
@@ -395,7 +400,8 @@ def _waiting_figure(result: Mounting, unit: Unit) -> Figure:
 
 def mounting_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
     """Lay out everything."""
-    g, names = result.geometry, result.geometry.channel_names
+    g = result.geometry
+    names = result.geometry.channel_names
     covariance = g.covariance(result.noise.noise_std**2) * unit.factor**2
     covariance[np.abs(covariance) < 1e-9 * covariance.max()] = 0.0
     rho = np.abs(g.rho)

@@ -100,11 +100,10 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
     Neighbouring windows are averaged.
     """
     filled = np.where(there[:, :, None] & there[:, None, :], covariance, 0.0)
-    near, beside = (
-        np.pad(filled, ((MEMORY, MEMORY), (0, 0), (0, 0))),
-        np.pad(there, ((MEMORY, MEMORY), (0, 0))),
-    )
-    total, weight = np.zeros_like(filled), np.zeros(len(filled))
+    near = np.pad(filled, ((MEMORY, MEMORY), (0, 0), (0, 0)))
+    beside = np.pad(there, ((MEMORY, MEMORY), (0, 0)))
+    total = np.zeros_like(filled)
+    weight = np.zeros(len(filled))
     for shift in reversed(range(2 * MEMORY + 1)):
         # The mean of covariances of other channels would be none.
         same = (there == beside[shift : shift + len(there)]).all(axis=1)
@@ -201,10 +200,8 @@ def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor
         windows |= quiet
         alike = (there == pattern[:, None]).all(axis=0)
         for rows, columns in patterns_of(there & quiet[:, None]):
-            samples, part = (
-                count[rows].sum(),
-                covariance[np.ix_(rows, columns, columns)],
-            )
+            samples = count[rows].sum()
+            part = covariance[np.ix_(rows, columns, columns)]
             (v,) = variances(
                 np.average(part, axis=0, weights=count[rows])[None], axes[columns]
             )

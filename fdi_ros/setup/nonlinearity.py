@@ -86,7 +86,8 @@ def measure(
     signals[:, :, 4] = ((time - time.mean()) / max(np.ptp(time), 1.0))[:, None]
     signals[:, :, 5] = np.abs(along)
     signals[:, :, 6] = along * np.abs(along) / largest
-    normal, right = np.zeros((n, SIGNALS, n, SIGNALS)), np.zeros((n, SIGNALS))
+    normal = np.zeros((n, SIGNALS, n, SIGNALS))
+    right = np.zeros((n, SIGNALS))
     known = information(variance, axes)
     for w in np.unique(window):
         rows = window == w
@@ -116,7 +117,8 @@ def _mean_square(shares: Array, covariance: Array, axes: Array) -> tuple[float, 
     apart = projector(axes)
     variance, directions = np.linalg.eigh(apart @ covariance @ apart)
     counts = variance > 1e-6 * variance.max()
-    variance, along = variance[counts], (directions.T @ shares)[counts]
+    variance = variance[counts]
+    along = (directions.T @ shares)[counts]
     weight = (variance + USUAL**2) ** -2.0
     square = np.average(along**2 - variance, weights=weight)
     return float(square), float(np.sqrt(2.0 / weight.sum()))

@@ -139,7 +139,8 @@ def turning_of(found: StateEstimate) -> tuple[Array, Array]:
 
     Also the covariance (W, 3, 3) of the noise of the angular acceleration.
     """
-    blocks, rate = found.blocks, found.rate
+    blocks = found.blocks
+    rate = found.rate
     span = blocks.seconds[2:] - blocks.seconds[:-2]
     acceleration = np.full_like(rate, np.nan)
     near = (span < 2.5 * blocks.length)[:, None]
@@ -182,7 +183,8 @@ def _position(
     """
     blocks = found.blocks
     # The noise of the difference is not that of the mean.
-    difference, mean = _smooth(other - first), _smooth(0.5 * (first + other))
+    difference = _smooth(other - first)
+    mean = _smooth(0.5 * (first + other))
     signals = np.zeros((len(mean), 3, BIASES + STATES - 3))
     signals[:, :, :3] = np.eye(3)
     signals[:, :, 3:6] = turning / FORCE.natural
@@ -194,7 +196,8 @@ def _position(
     known = count >= LEAST_BLOCKS
     if known.sum() < LEAST_BLOCKS:
         return np.zeros(3), np.full(3, POSITION_STD)
-    signals[~good], difference = 0.0, np.where(good[:, None], difference, 0.0)
+    signals[~good] = 0.0
+    difference = np.where(good[:, None], difference, 0.0)
     # Of noise alone no position is learned.
     subtracted = np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(3) - noise
     subtracted /= FORCE.natural**2

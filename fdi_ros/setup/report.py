@@ -107,13 +107,13 @@ def calibration_findings(
 
 def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     """Yield noise, remaining errors in motion, walk of the biases, and delays."""
-    found, name, factor = result.estimate, unit.name, unit.factor
-    rest, walk, floor, usual = (
-        found.rest_seconds,
-        found.bias_walk,
-        found.floor,
-        np.median(found.moment, axis=0),
-    )
+    found = result.estimate
+    name = unit.name
+    factor = unit.factor
+    rest = found.rest_seconds
+    walk = found.bias_walk
+    floor = found.floor
+    usual = np.median(found.moment, axis=0)
     words = f"axes, biases and noise, from {rest:.1f} s at rest and {result.duration - rest:.1f} s in motion"
     yield Finding(Role.FOUND, "time at rest", words, value=rest)
     (least, most), (low, high) = (
@@ -163,7 +163,8 @@ def _position(axis: str, value: float, error: float) -> str:
 def _positions(result: Calibration) -> Iterator[Finding]:
     """Yield the positions of accelerometers, measured or not."""
     for one in result.positions:
-        name, known = one.name, one.measured
+        name = one.name
+        known = one.measured
         values = [
             _position(axis, value, error) if shows else f"{axis} not measured"
             for axis, value, error, shows in zip(
@@ -201,7 +202,8 @@ def _delay_words(delay: StampDelay, corrected: bool) -> str:
 
 def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Finding]:
     """Yield unobserved quantities with the assumption made and the remedy."""
-    found, share = result.estimate, result.estimate.floor.share
+    found = result.estimate
+    share = result.estimate.floor.share
     if not found.rest_seconds:
         common = float(np.sqrt(np.mean(result.bias_std**2)))
         words = f"never at rest: a bias common to all gyros looks like a rotation (+-{common * unit.factor:.2g}"
@@ -211,7 +213,8 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
     elif share <= LEAST_SHARE:
         words = f"noise_std is from the quietest {share:.0%} of the recording: a longer rest gives a better value"
         yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=LEAST_SHARE)
-    error, rms = result.axis_errors, np.std(found.rate, axis=0) * unit.factor
+    error = result.axis_errors
+    rms = np.std(found.rate, axis=0) * unit.factor
     if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:
         which = " and ".join(unmeasured)
         along, about = (
@@ -266,14 +269,17 @@ def _accelerometers(result: Calibration) -> Iterator[Finding]:
 
 def _found_forces(fit: AccelerometerFit) -> Iterator[Finding]:
     """Yield noise, biases and scale error of the accelerometers."""
-    found, name = fit.estimate, FORCES.name
-    low, high = found.floor.std.min(), found.floor.std.max()
+    found = fit.estimate
+    name = FORCES.name
+    low = found.floor.std.min()
+    high = found.floor.std.max()
     usual = np.median(found.moment, axis=0)
     words = f"accelerometers: noise {low:.2g} to {high:.2g} {name}, in the quietest"
     words += f" {found.floor.share:.0%} of the recording; median with vibration"
     words += f" {usual.min():.2g} to {usual.max():.2g}"
     largest = int(found.floor.std.argmax())
-    noise, error = found.floor.std[largest], found.floor.error[largest]
+    noise = found.floor.std[largest]
+    error = found.floor.error[largest]
     yield Finding(
         Role.FOUND, "accelerometer noise", words, (), float(noise), float(error)
     )
@@ -282,7 +288,8 @@ def _found_forces(fit: AccelerometerFit) -> Iterator[Finding]:
     words += " are larger than their errors"
     if shown.any():
         largest = int(np.where(shown, np.abs(found.bias), 0.0).argmax())
-        value, error = float(found.bias[largest]), float(fit.bias_std[largest])
+        value = float(found.bias[largest])
+        error = float(fit.bias_std[largest])
         words += (
             f", the largest {fit.names[largest]} {value:+.3f} +- {error:.3f} {name}"
         )
@@ -315,7 +322,8 @@ def _unknown_forces(fit: AccelerometerFit) -> Iterator[Finding]:
 
 def _force_warnings(fit: AccelerometerFit) -> Iterator[Finding]:
     """Yield declarations, unequal noise and large biases of the accelerometers."""
-    found, name = fit.estimate, FORCES.name
+    found = fit.estimate
+    name = FORCES.name
     if fit.faults:
         yield _declared(fit.faults, fit.names)
     if noisy := much_noisier(found.floor.std, fit.units):
@@ -370,7 +378,8 @@ class _Bound(NamedTuple):
 
 def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
     """Yield warnings: faults, lost values, and channels beyond a bound."""
-    found, names = result.estimate, result.names
+    found = result.estimate
+    names = result.names
     if result.faults:
         yield _declared(result.faults, names)
     if lost := _lost_words(result):
@@ -406,7 +415,8 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
 
 def _lost_words(result: Calibration) -> list[str]:
     """Words for values that were not used, by the reason."""
-    found, words = result.estimate, []
+    found = result.estimate
+    words = []
     for why, count in result.unusable.items():
         usual = why in ("missing", "spikes")
         if count.max() <= (MANY * found.blocks.count.sum() if usual else 0):
@@ -420,7 +430,8 @@ def _lost_words(result: Calibration) -> list[str]:
 
 def _bounds(result: Calibration, unit: Unit) -> list[_Bound]:
     """Return the figures of gyros that are worth a look beyond a bound."""
-    found, rate = result.estimate, f"{{:.3g}} {unit.name}"
+    found = result.estimate
+    rate = f"{{:.3g}} {unit.name}"
     swing = np.ptp(found.curve, axis=0)
     degrees = float(np.degrees(1.0))
     return [
@@ -447,12 +458,11 @@ def _bounds(result: Calibration, unit: Unit) -> list[_Bound]:
 
 def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding]:
     """Yield all findings: basis and worth of the settings, unknowns, warnings."""
-    result, mounting, units = (
-        found.calibration,
-        found.mounting,
-        source_of(found.config).units,
-    )
-    g, rate = mounting.geometry, found.config.sample_rate
+    result = found.calibration
+    mounting = found.mounting
+    units = source_of(found.config).units
+    g = mounting.geometry
+    rate = found.config.sample_rate
     yield from _worth(found, unit)
     where = f"{len(units)} units" if units else "one array"
     yield Finding(
@@ -492,7 +502,8 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
 
 def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
     """Yield the verdict on the settings: the worst trouble, or their isolation."""
-    proof, units = found.proof, source_of(found.config).units
+    proof = found.proof
+    units = source_of(found.config).units
     tried = proof.before if found.kept else proof.after
     warning = Role.WARNING
     if found.disagree:
@@ -593,7 +604,9 @@ def _not_shown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
 
 def calibration_figures(result: Calibration) -> dict[str, object]:
     """Return all figures by name, SI units: for programs."""
-    names, found, rest = result.names, result.estimate, result.estimate.rest_seconds
+    names = result.names
+    found = result.estimate
+    rest = result.estimate.rest_seconds
     return {
         "seconds": {
             "all": result.duration,
@@ -668,7 +681,9 @@ def _beyond_error(values: Array, errors: Array, factor: float, form: str) -> lis
 
 def channel_columns(result: ChannelFit, unit: Unit = RADIANS) -> list[Column]:
     """Figures of every channel, one row each."""
-    found, rate, degrees = result.estimate, unit.factor, float(np.degrees(1.0))
+    found = result.estimate
+    rate = unit.factor
+    degrees = float(np.degrees(1.0))
 
     def measured(values: Array, form: str) -> list[str]:
         return [
@@ -794,7 +809,8 @@ def _tried(found: SetupResult, unit: Unit = RADIANS) -> list[Column]:
 
 def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
     """Return everything, for programs, in SI units."""
-    result, proof = found.calibration, found.proof
+    result = found.calibration
+    proof = found.proof
     tried = dict(zip(("before", "after"), figures_of(_tried(found)), strict=True))
     return {
         "bag": bag,
@@ -825,10 +841,13 @@ def _sections(
     found: SetupResult, findings: Sequence[Finding], bag: str, config: str, unit: Unit
 ) -> tuple[list[str], list[Section]]:
     """Return the verdict with its basis, and the other sections."""
-    proof, result, first = found.proof, found.calibration, verdict_of(findings)
+    proof = found.proof
+    result = found.calibration
+    first = verdict_of(findings)
     hint = f"Replay of {proof.source}: unchanged, then with a bias injected on each channel at {TIMES} times."
     hint += f" Isolated: within {WITHIN:g} s."
-    bag, config = shlex.quote(bag), shlex.quote(config)
+    bag = shlex.quote(bag)
+    config = shlex.quote(config)
     steps = [
         f"fdi replay {bag} --config {config} --report replay.html   # the verdict on this recording",
         f"fdi sweep {bag} --config {config} --report sweep.html     # which faults the monitor would find in it",
@@ -910,7 +929,8 @@ def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Secti
     """Plot changes over the recording, and the spectrum of differences."""
     if result is None:
         return [Section("Axes, delays and biases", f"Not known: {refused}.")]
-    found, names = result.estimate, result.names
+    found = result.estimate
+    names = result.names
     times = found.blocks.time
     half = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     rests = [
@@ -935,10 +955,8 @@ def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Secti
         names: Sequence[str], x: Array, y: Array, **more: object
     ) -> list[dict[str, object]]:
         step = max(len(x) // 2000, 1)
-        at, look = (
-            np.round(x[::step], 3).tolist(),
-            {"type": "scatter", "mode": "lines", **more},
-        )
+        at = np.round(x[::step], 3).tolist()
+        look = {"type": "scatter", "mode": "lines", **more}
         lines = [
             {"name": name, "line": {"color": colour_of(i), "width": 1.2}, **look}
             for i, name in enumerate(names)

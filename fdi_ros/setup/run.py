@@ -124,7 +124,8 @@ class Proof:
     @property
     def worse(self) -> str:
         """Words for worse performance than before, or empty."""
-        before, after = self.before, self.after
+        before = self.before
+        after = self.after
         (was, tried_before), (now, tried) = before.isolated_of, after.isolated_of
         new = {
             name: at
@@ -271,7 +272,8 @@ def set_up(
     or has no gyros, or no monitor can be built.
     """
     reports, damage = inspect(bag)
-    chosen, lacking = candidates(reports), needs(reports)
+    chosen = candidates(reports)
+    lacking = needs(reports)
     if not chosen:
         topics = [
             f"{shown(one.topic.name)} ({shown(one.topic.type or 'unknown')}, {one.received} messages)"
@@ -375,23 +377,22 @@ def _proved(
     Then take the settings of the whole recording, or those before. ``needed`` makes a
     missing calibration of the first part an error.
     """
-    learned, apart, source = (
-        block,
-        proof is not None,
-        "the same recording (too short to hold a part back)",
-    )
+    learned = block
+    apart = proof is not None
+    source = "the same recording (too short to hold a part back)"
     if proof is not None:
-        bag, start, end, source = proof, 0.0, math.inf, shown(proof.name)
+        bag = proof
+        start = 0.0
+        end = math.inf
+        source = shown(proof.name)
     elif (kept := _kept_from(block)) is not None:
         since, seconds = kept
         learned = block[
             : int(np.searchsorted(block.stamp, block.stamp[0] + round(since * 1e9)))
         ]
-        start, apart, source = (
-            start + since,
-            True,
-            f"the last {seconds:.0f} s",
-        )
+        start = start + since
+        apart = True
+        source = f"the last {seconds:.0f} s"
     before, found = learn(learned)
     if needed and found.why is not None:
         raise found.why
@@ -409,7 +410,8 @@ def _proved(
     if learned is not block:
         whole_before, whole = learn(block)
         if whole.calibration is not None or found.calibration is None:
-            before, found = whole_before, whole
+            before = whole_before
+            found = whole
     if worse:
         found = replace(found, parameters=before.parameters, config=before.config)
     return SetupResult(
@@ -441,7 +443,8 @@ def _with_mounts(
     block: Block, before: LearnedSettings, reference: str
 ) -> LearnedSettings:
     """Calibrate with the mounts found. Mirrored units are refused."""
-    names, mounts = before.config.imu_names, before.mounts
+    names = before.config.imu_names
+    mounts = before.mounts
     if odd := [
         name for name, mount in zip(names, mounts, strict=False) if mount.mirrored
     ]:

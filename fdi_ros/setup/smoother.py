@@ -48,12 +48,12 @@ class NormalEquations:
         prior: Array,
         start: Array,
     ) -> None:
-        self.n, self.apart, self.prior = n, apart, prior
-        self.normal, self.right, self.start = (
-            normal * np.outer(prior, prior),
-            right * prior,
-            start / prior,
-        )
+        self.n = n
+        self.apart = apart
+        self.prior = prior
+        self.normal = normal * np.outer(prior, prior)
+        self.right = right * prior
+        self.start = start / prior
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,8 @@ def _eliminate(of: NormalEquations, walk: float) -> tuple[Array, Array, Array, f
     (the biases for zero constants), information (m, m) on the constants with its
     right-hand side (m,), and the log marginal likelihood.
     """
-    n, count = of.n, len(of.normal)
+    n = of.n
+    count = len(of.normal)
     stiffness = of.prior[0] ** 2 / (max(walk, NO_WALK) ** 2 * of.apart[:-1])[:, None]
     blocks = of.normal[:, :n, :n].copy()
     diagonal = np.einsum("kii->ki", blocks)
@@ -99,14 +100,16 @@ def _eliminate(of: NormalEquations, walk: float) -> tuple[Array, Array, Array, f
     for below in range(n):
         band[below, :, : n - below] = np.diagonal(blocks, -below, 1, 2)
     band[n, :-1] = -stiffness
-    border, h = of.normal[:, :n, n:].reshape(count * n, -1), of.right[:, :n].copy()
+    border = of.normal[:, :n, n:].reshape(count * n, -1)
+    h = of.right[:, :n].copy()
     h[0] += of.start[:n]
     factor = cholesky_banded(band.reshape(n + 1, -1), lower=True)
     mean = np.tile(np.eye(n) / count, (count, 1))
     solved = cho_solve_banded(
         (factor, True), np.column_stack([mean, border, h.ravel()])
     )
-    from_constants, alone = solved[:, n:-1], solved[:, -1]
+    from_constants = solved[:, n:-1]
+    alone = solved[:, -1]
     information = (
         np.eye(border.shape[1])
         + of.normal[:, n:, n:].sum(axis=0)
@@ -154,10 +157,8 @@ def smooth(
         constant = covariance @ side
     else:
         k = len(known[0])
-        first, p = (
-            known[0] / of.prior[n : n + k],
-            known[1] / np.outer(of.prior[n : n + k], of.prior[n : n + k]),
-        )
+        first = known[0] / of.prior[n : n + k]
+        p = known[1] / np.outer(of.prior[n : n + k], of.prior[n : n + k])
         free = np.linalg.inv(information[k:, k:])
         by = -free @ information[k:, :k]
         constant = np.concatenate([first, free @ side[k:] + by @ first])
@@ -165,7 +166,8 @@ def smooth(
     curve = (solved[:, -1] - solved[:, n:-1] @ constant).reshape(-1, n)
     # The mean of the biases by itself, and by the constants.
     mean = solved.reshape(len(curve), n, -1).mean(axis=0)
-    alone, each = mean[:, :n], mean[:, n:-1]
+    alone = mean[:, :n]
+    each = mean[:, n:-1]
     unit = of.prior[n:]
     return Smoothed(
         constant * unit,

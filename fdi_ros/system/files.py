@@ -284,7 +284,8 @@ def whole(path: Path) -> Iterator[Path]:
         return
     path = real_path(path)
     with _scratch(path, path.parent) as folder:
-        new, before = folder / path.name, folder / f"{path.name}.before"
+        new = folder / path.name
+        before = folder / f"{path.name}.before"
         yield new
         # os.replace exchanges files in one step, but a folder only replaces a missing
         # path.

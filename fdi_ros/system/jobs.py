@@ -101,7 +101,8 @@ def _on_processes(
 
     A process pool would end all its processes together.
     """
-    waiting, deaths = deque(range(len(jobs))), Counter[int]()
+    waiting = deque(range(len(jobs)))
+    deaths = Counter[int]()
     idle = [ProcessPoolExecutor(1, env=ONE_THREAD) for _ in range(workers)]
     running: dict[Future[Any], tuple[int, ProcessPoolExecutor]] = {}
 

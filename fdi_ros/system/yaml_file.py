@@ -127,10 +127,8 @@ def _problem(refused: yaml.YAMLError) -> str:
     """Describe a YAML error by its line and column."""
     if not isinstance(refused, yaml.MarkedYAMLError) or refused.problem_mark is None:
         return " ".join(str(refused).replace(' in "<unicode string>"', "").split())
-    mark, why = (
-        refused.problem_mark,
-        ", ".join(filter(None, (refused.context, refused.problem))),
-    )
+    mark = refused.problem_mark
+    why = ", ".join(filter(None, (refused.context, refused.problem)))
     return " ".join(f"line {mark.line + 1}, column {mark.column + 1}: {why}".split())
 
 
@@ -165,11 +163,13 @@ def _check_size(text: str) -> None:
     for event in yaml.parse(text, Loader=_Loader):
         if isinstance(event, yaml.CollectionEndEvent):
             ended = outer.pop()
-            anchor, before = ended.anchor, ended.before
+            anchor = ended.anchor
+            before = ended.before
         elif isinstance(event, yaml.NodeEvent):
             if outer:
                 outer[-1].add(event)
-            anchor, before = event.anchor, count
+            anchor = event.anchor
+            before = count
             alias = isinstance(event, yaml.AliasEvent)
             if alias and event.anchor not in sizes:
                 raise _Refused(

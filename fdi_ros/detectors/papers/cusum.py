@@ -93,9 +93,11 @@ def threshold_for(run_length: float, reference: float, correlation: Array) -> fl
     ConfigError
         If the run length is too short for any positive threshold.
     """
-    count, overshoot = len(correlation), mean_overshoot(reference)
+    count = len(correlation)
+    overshoot = mean_overshoot(reference)
     apart = 1 - np.clip(correlation[~np.eye(count, dtype=bool)], -1, 1)
-    single, threshold = count * run_length, 0.0
+    single = count * run_length
+    threshold = 0.0
     for _ in range(8):
         threshold = _single_threshold(single, reference)
         b = threshold + overshoot
@@ -231,11 +233,13 @@ def judge(
     params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
     """Advance all sums by one sample. On alarm, name the channels by the largest sum."""
-    sensors, room = params.sensors, state.room
+    sensors = params.sensors
+    room = state.room
     n = sensors.n
     fill_scratch(params.resting, sensors, sample, room)
     for i in range(n):
-        state.resting[i], state.variance[i] = room.residual[i], 1.0
+        state.resting[i] = room.residual[i]
+        state.variance[i] = 1.0
     if not sensors.constant:
         plain_variances(params, sample, state)
         fill_scratch(params.hypotheses, sensors, sample, room)
@@ -249,21 +253,25 @@ def judge(
             if sensors.constant
             else whitened(params.hypotheses, sensors, sample, room, i)
         )
-        largest, size = max(largest, abs(w0)), max(size, abs(verdict.scores[i]))
+        largest = max(largest, abs(w0))
+        size = max(size, abs(verdict.scores[i]))
         spread = max(spread, state.variance[i])
         systematic = max(systematic, state.variance[i] - 1.0 + params.bias[i])
     factor = min(1.0 / math.sqrt(spread), LARGEST / largest)
     lasting = min(factor * math.sqrt(systematic), LARGEST)
     shrink = min(1.0, LARGEST / size)
-    verdict.statistic, verdict.threshold = 0.0, params.threshold
+    verdict.statistic = 0.0
+    verdict.threshold = params.threshold
     for i in range(n):
-        w, variance = verdict.scores[i] * shrink, state.variance[i]
+        w = verdict.scores[i] * shrink
+        variance = state.variance[i]
         less = min(
             params.half_shift
             + SYSTEMATIC * math.sqrt((variance - 1.0 + params.bias[i]) / variance),
             LARGEST,
         )
-        down, up = state.sides[i], state.sides[MAX_CHANNELS + i]
+        down = state.sides[i]
+        up = state.sides[MAX_CHANNELS + i]
         advance(down, params, -w - less, factor, lasting, state.resting)
         advance(up, params, w - less, factor, lasting, state.resting)
         verdict.scores[i] = max(down.total, up.total)
@@ -278,7 +286,8 @@ def judge(
 @compiled
 def plain_variances(params: Constants, sample: SampleInput, state: State) -> None:
     """Write the variance of every w0 by all errors of this sample to ``state.variance``."""
-    sensors, rate = params.sensors, state.room.correction
+    sensors = params.sensors
+    rate = state.room.correction
     n = sensors.n
     for a in range(3):
         rate[a] = 0.0
@@ -351,7 +360,8 @@ class Cusum(Detector):
             noise,
             {"shift": shift, "run_length": self.run_length, "confidence": confidence},
         )
-        params, n = self.constants[0], geometry.n
+        params = self.constants[0]
+        n = geometry.n
         prepare_hypotheses(
             params["resting"], geometry, self.noise, confidence, fixed=True
         )
@@ -378,11 +388,9 @@ class Cusum(Detector):
         )
         self.window = math.ceil(16 * self.threshold / shift) + 1
         """Largest number of samples after the onset used to name a channel."""
-        params["half_shift"], params["threshold"], params["window"] = (
-            shift / 2,
-            self.threshold,
-            self.window,
-        )
+        params["half_shift"] = shift / 2
+        params["threshold"] = self.threshold
+        params["window"] = self.window
 
     def samples_since_onset(self) -> NDArray[np.int64]:
         """Return the number of samples since the estimated onset in each channel, (n,).
@@ -390,6 +398,8 @@ class Cusum(Detector):
         0: no drift. `window`: that long or longer. The larger of a channel's two sums
         counts.
         """
-        sides, n = self.states[0]["sides"], self.geometry.n
-        down, up = sides[:n], sides[MAX_CHANNELS : MAX_CHANNELS + n]
+        sides = self.states[0]["sides"]
+        n = self.geometry.n
+        down = sides[:n]
+        up = sides[MAX_CHANNELS : MAX_CHANNELS + n]
         return np.where(up["total"] >= down["total"], up["count"], down["count"])

@@ -42,7 +42,9 @@ def circuits(axes: Array) -> Array:
     """
     norm = np.linalg.norm(axes, axis=1)
     unit = axes / norm[:, None]
-    lines, planes, spaces = _pairs(unit), _triples(unit), _quadruples(unit)
+    lines = _pairs(unit)
+    planes = _triples(unit)
+    spaces = _quadruples(unit)
     planes = planes[~_contains(planes, lines)]
     spaces = spaces[~_contains(spaces, np.vstack([lines, planes]))]
     return np.vstack([lines, planes, spaces]) / norm
@@ -96,7 +98,8 @@ def _scatter(index: NDArray[np.intp], values: Array, n: int) -> Array:
 
 def _contains(rows: Array, smaller: Array) -> NDArray[np.bool_]:
     """Return for each row whether its support contains that of a smaller circuit."""
-    support, small = (rows != 0).astype(np.int64), (smaller != 0).astype(np.int64)
+    support = (rows != 0).astype(np.int64)
+    small = (smaller != 0).astype(np.int64)
     contains: NDArray[np.bool_] = (support @ small.T == small.sum(axis=1)).any(axis=1)
     return contains
 
@@ -192,7 +195,8 @@ def explain(params: Circuits, found: Findings) -> int:
             # The worst in front rejects most explanations at once.
             worst = found.violated[0]
             if found.violations and abs(found.value[k]) > abs(found.value[worst]):
-                found.violated[0], found.violated[found.violations] = k, worst
+                found.violated[0] = k
+                found.violated[found.violations] = worst
             else:
                 found.violated[found.violations] = k
             found.violations += 1
@@ -208,7 +212,8 @@ def mildest(params: Circuits, found: Findings) -> float:
     """Return the largest error, in bounds, of the mildest explanation of the sample."""
     least = math.inf
     for m in range(found.explanations):
-        members, largest = params.members[found.explains[m]], 0.0
+        members = params.members[found.explains[m]]
+        largest = 0.0
         for v in range(found.violations):
             k = found.violated[v]
             # Errors of t bounds in the faulty members allow a check of 1 + (t - 1) weight.
@@ -224,7 +229,8 @@ def mildest(params: Circuits, found: Findings) -> float:
 def intervals(params: Circuits, found: Findings) -> None:
     """Write the interval of each channel's error over all explanations, or NaN."""
     for i in range(params.sensors.n):
-        lower, upper = math.inf, -math.inf
+        lower = math.inf
+        upper = -math.inf
         # Intervals are widest for sets that contain the channel. Evaluated first, they
         # make most other sets unnecessary.
         for faulty in (True, False):
@@ -238,12 +244,12 @@ def intervals(params: Circuits, found: Findings) -> None:
                     if low >= lower and high <= upper:
                         break
                     c = params.which[i, f, u]
-                    centre, half = (
-                        found.value[params.circuit[i, c]] * params.slope[i, c],
-                        params.half[i, c],
-                    )
-                    low, high = max(low, centre - half), min(high, centre + half)
-                lower, upper = min(lower, low), max(upper, high)
+                    centre = found.value[params.circuit[i, c]] * params.slope[i, c]
+                    half = params.half[i, c]
+                    low = max(low, centre - half)
+                    high = min(high, centre + half)
+                lower = min(lower, low)
+                upper = max(upper, high)
         found.lower[i] = lower if found.explanations else math.nan
         found.upper[i] = upper if found.explanations else math.nan
 
@@ -254,7 +260,8 @@ def name_suspects(params: Circuits, found: Findings, verdict: SampleVerdict) -> 
 
     The verdict isolates if all of them failed in each explanation.
     """
-    n, any_found = params.sensors.n, False
+    n = params.sensors.n
+    any_found = False
     for i in range(n):
         beyond = params.threshold * params.bound[i]
         if params.sensors.detectable[i] and (
@@ -266,11 +273,9 @@ def name_suspects(params: Circuits, found: Findings, verdict: SampleVerdict) -> 
                     verdict.suspects[j] = params.sensors.detectable[j]
     verdict.isolated = True
     for i in range(n):
-        lower, upper, beyond = (
-            found.lower[i],
-            found.upper[i],
-            params.threshold * params.bound[i],
-        )
+        lower = found.lower[i]
+        upper = found.upper[i]
+        beyond = params.threshold * params.bound[i]
         # No explanation, or only undetectable channels could have failed.
         if not any_found:
             verdict.suspects[i] = params.sensors.detectable[i]
@@ -286,7 +291,8 @@ def judge(
     params: Circuits, found: Findings, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
     """Judge one sample by its checks, and if these imply a fault, by all explanations."""
-    verdict.statistic, verdict.threshold = check(params, sample.z, found), params.limit
+    verdict.statistic = check(params, sample.z, found)
+    verdict.threshold = params.limit
     if verdict.statistic < min(WITHIN, params.limit):
         return
     explain(params, found)
@@ -317,7 +323,8 @@ def explain_rows(
         ruled_out[k] = explain(params[0], found[0])
         intervals(params[0], found[0])
         for i in range(params[0].sensors.n):
-            lower[k, i], upper[k, i] = found[0].lower[i], found[0].upper[i]
+            lower[k, i] = found[0].lower[i]
+            upper[k, i] = found[0].upper[i]
 
 
 class Guaranteed(Detector):
@@ -396,7 +403,8 @@ class Guaranteed(Detector):
         )
         """Sets of possibly faulty channels, smallest first: columns of `culprits`."""
         params = self.constants[0]
-        params["bound"][: geometry.n], params["threshold"] = self.bound, threshold
+        params["bound"][: geometry.n] = self.bound
+        params["threshold"] = threshold
         params["limit"] = threshold if self.max_faults else WITHIN
         checks = circuits(geometry.axes)
         checks /= (np.abs(checks) * self.bound).sum(axis=1)[:, None]
@@ -415,7 +423,8 @@ class Guaranteed(Detector):
     def _prepare_checks(self, checks: Array) -> None:
         """Write checks (C, n), and for each the sets that leave all its members healthy."""
         params, (count, n) = self.constants[0], checks.shape
-        params["circuits"], params["checks"][:n, :count] = count, checks.T
+        params["circuits"] = count
+        params["checks"][:n, :count] = checks.T
         params["weight"][:count, :n] = np.abs(checks) * self.bound
         struck = np.array([[i in channels for i in range(n)] for channels in self.sets])
         untouched = (struck @ (checks != 0).T) == 0
@@ -423,11 +432,9 @@ class Guaranteed(Detector):
         largest = [
             channels for channels in self.sets if len(channels) == self.max_faults
         ]
-        params["faults"], params["sets"], params["first"] = (
-            self.max_faults,
-            len(largest),
-            len(self.sets) - len(largest),
-        )
+        params["faults"] = self.max_faults
+        params["sets"] = len(largest)
+        params["first"] = len(self.sets) - len(largest)
         params["members"] = ABSENT
         params["members"][: len(largest), : self.max_faults] = largest
 
@@ -440,19 +447,15 @@ class Guaranteed(Detector):
             # The narrowest intervals first: then later ones seldom change the result.
             order = np.argsort(half, kind="stable")
             through, count = through[order], len(through)
-            params["circuit"][i, :count], params["half"][i, :count] = (
-                through,
-                half[order],
-            )
+            params["circuit"][i, :count] = through
+            params["half"][i, :count] = half[order]
             params["slope"][i, :count] = 1 / checks[through, i]
             others = np.delete(checks[through] != 0, i, axis=1)
             for f, channels in enumerate(self.sets[params["first"] :]):
                 struck = [j in channels for j in range(self.geometry.n) if j != i]
                 usable = np.flatnonzero(~others[:, struck].any(axis=1))
-                params["usable"][i, f], params["which"][i, f, : len(usable)] = (
-                    len(usable),
-                    usable,
-                )
+                params["usable"][i, f] = len(usable)
+                params["which"][i, f, : len(usable)] = usable
 
     @property
     def isolable(self) -> Mask:
@@ -485,7 +488,8 @@ class Guaranteed(Detector):
             If z does not have n columns.
         """
         z = self._checked(z)
-        lower, upper = np.full(z.shape, np.nan), np.full(z.shape, np.nan)
+        lower = np.full(z.shape, np.nan)
+        upper = np.full(z.shape, np.nan)
         present = np.isfinite(z)
         masks = present @ (1 << np.arange(self.geometry.n))
         for mask in np.unique(masks).tolist():
@@ -498,11 +502,9 @@ class Guaranteed(Detector):
 
     def _explain(self, z: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """Return the masks of ruled-out sets and the intervals of finite samples z (N, n)."""
-        ruled_out, lower, upper = (
-            np.empty(len(z), dtype=np.int64),
-            np.empty(z.shape),
-            np.empty(z.shape),
-        )
+        ruled_out = np.empty(len(z), dtype=np.int64)
+        lower = np.empty(z.shape)
+        upper = np.empty(z.shape)
         explain_rows(self.constants, allocate(Findings), z, ruled_out, lower, upper)
         return ruled_out, lower, upper
 

@@ -73,8 +73,10 @@ def judge_one_norm(
     params: OneNorm, state: NoState, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
     """Judge one sample by the error of least 1-norm that explains the sample."""
-    n, z = params.sensors.n, sample.z
-    best, least = 0, np.inf
+    n = params.sensors.n
+    z = sample.z
+    best = 0
+    least = np.inf
     for b in range(params.sets):
         norm = 0.0
         for k in range(n - 3):
@@ -82,7 +84,8 @@ def judge_one_norm(
             if norm >= least:
                 break
         if norm < least:
-            best, least = b, norm
+            best = b
+            least = norm
     # The scores of all other channels are already zero.
     for k in range(n - 3):
         verdict.scores[params.channels[best, k]] = abs(
@@ -146,11 +149,9 @@ class Projector(SingleFaultDetector):
         if one:
             sets, solutions = _basic_solutions(self.basis, geometry.detectable)
             count, m, n = solutions.shape
-            (
-                params["sets"],
-                params["channels"][:count, :m],
-                params["solutions"][:count, :m, :n],
-            ) = count, sets, solutions
+            params["sets"] = count
+            params["channels"][:count, :m] = sets
+            params["solutions"][:count, :m, :n] = solutions
         else:
             set_forms(
                 params, _unexplained(self.basis, geometry.detectable), squares=True
@@ -226,14 +227,17 @@ def judge_innovations(
 
     Forms [k, i] are those of `innovations`.
     """
-    n, largest = params.sensors.n, 0.0
+    n = params.sensors.n
+    largest = 0.0
     fill_variances(params, sample, verdict)
     for i in range(n):
-        before, last = 0.0, 0.0
+        before = 0.0
+        last = 0.0
         for k in range(n - 3):
             form = params.forms[k, i]
             innovation = dot(form, sample.z, n) / std_of(params, form, 1.0, verdict)
-            before, last = last, innovation * innovation
+            before = last
+            last = innovation * innovation
             largest = max(largest, last)
         verdict.scores[i] = last / (before + NOTHING) if n > 4 else last
     conclude(params, worst(params, verdict), largest, params.limit, sample, verdict)
@@ -268,10 +272,8 @@ class Recursive(SingleFaultDetector):
     def __init__(self, geometry: Geometry, noise: NoiseModel, **rate: Any) -> None:
         n = geometry.n
         super().__init__(geometry, noise, {}, largest=True, scored=n > 4, **rate)
-        params, forms = (
-            self.constants[0],
-            innovations(geometry.axes, self.noise.noise_std),
-        )
+        params = self.constants[0]
+        forms = innovations(geometry.axes, self.noise.noise_std)
         set_forms(params, forms)
         params["limit"] = (
             largest_form_threshold(
@@ -366,19 +368,24 @@ def condition_without(params: Struck, j: int, sample: SampleInput) -> float:
     largest root of ``sum_k (u_k / s_k)^2 / (x - delta^2 / s_k^2) + 1 / x = 1``. Neither
     equation divides by delta, which is zero for a failed row without noise.
     """
-    u, z = params.complement[j], sample.z
-    s, t, v = params.singular[j, 0], params.singular[j, 1], params.singular[j, 2]
-    a, b, c = (
-        dot(u[0], z, CHANNELS),
-        dot(u[1], z, CHANNELS),
-        dot(u[2], z, CHANNELS),
-    )
+    u = params.complement[j]
+    z = sample.z
+    s = params.singular[j, 0]
+    t = params.singular[j, 1]
+    v = params.singular[j, 2]
+    a = dot(u[0], z, CHANNELS)
+    b = dot(u[1], z, CHANNELS)
+    c = dot(u[2], z, CHANNELS)
     delta = abs(dot(u[3], z, CHANNELS))
     largest = largest_root(
         (a * a, b * b, c * c, delta * delta), (s * s, t * t, v * v, 0.0)
     )
-    a, b, c = a / s, b / t, c / v
-    s, t, v = delta / s, delta / t, delta / v
+    a = a / s
+    b = b / t
+    c = c / v
+    s = delta / s
+    t = delta / t
+    v = delta / v
     inverse = largest_root((a * a, b * b, c * c, 1.0), (s * s, t * t, v * v, 0.0))
     product = math.sqrt(largest) * math.sqrt(inverse)
     return product / delta if delta > NO_POWER * product else math.inf
@@ -397,7 +404,8 @@ def largest_root(powers: Four, poles: Four) -> float:
     # Just beyond the pole. Then about five steps suffice.
     x *= 1 + 1e-15
     for _ in range(40):
-        value, slope = 0.0, 0.0
+        value = 0.0
+        slope = 0.0
         for k in range(4):
             inverse = 1.0 / (x - poles[k])
             term = (powers[k] + NO_POWER) * inverse

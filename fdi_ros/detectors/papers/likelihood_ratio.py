@@ -109,7 +109,9 @@ def prepare_hypotheses(
         raise ConfigError(
             f"confidence is {confidence:g}, expected above 0.5 and below 1"
         )
-    n, m, rest = geometry.n, geometry.n - 3, 1 - confidence
+    n = geometry.n
+    m = geometry.n - 3
+    rest = 1 - confidence
     params["fixed"] = fixed
     params["residual"][:n, :n] = (
         whitened_residuals(geometry, noise) if fixed else geometry.S
@@ -119,7 +121,8 @@ def prepare_hypotheses(
     params["unit_limit"] = chi2_isf(rest, m - 3) if m > 3 else math.inf
     params["rival_margin"] = 2 * math.log(confidence / rest)
     # A pair of five channels explains every sample.
-    params["can_isolate"], params["pairs"] = m > 1, n > 5
+    params["can_isolate"] = m > 1
+    params["pairs"] = n > 5
     units = [unit for unit in geometry.units if _may_be_one_fault(geometry, unit)]
     params["units"] = len(units)
     params["unit"][: len(units)] = np.reshape(units, (-1, 3))
@@ -175,12 +178,21 @@ def leave_out(
 
     b and c may be -1: none. Errors are in the places of their channels.
     """
-    S, r = params.residual, room.residual
-    e0, e1, e2 = r[a] / S[a, a], 0.0, 0.0
+    S = params.residual
+    r = room.residual
+    e0 = r[a] / S[a, a]
+    e1 = 0.0
+    e2 = 0.0
     if c >= 0:
-        p, q, t = S[a, a], S[a, b], S[a, c]
-        u, v, w = S[b, b], S[b, c], S[c, c]
-        x, y, z = u * w - v * v, t * v - q * w, q * v - t * u
+        p = S[a, a]
+        q = S[a, b]
+        t = S[a, c]
+        u = S[b, b]
+        v = S[b, c]
+        w = S[c, c]
+        x = u * w - v * v
+        y = t * v - q * w
+        z = q * v - t * u
         det = p * x + q * y + t * z
         e0 = (x * r[a] + y * r[b] + z * r[c]) / det
         e1 = (y * r[a] + (p * w - t * t) * r[b] + (q * t - p * v) * r[c]) / det
@@ -213,7 +225,8 @@ def correct_rate(
     noise. Thus the weighted solution is a small correction, and a large rate costs no
     digits. Return the remaining chi-square.
     """
-    n, kept = sensors.n, room.kept
+    n = sensors.n
+    kept = room.kept
     smallest = math.inf
     for j in range(n):
         scale = sensors.scale_std[j] * (sample.z[j] - kept[j])
@@ -226,7 +239,9 @@ def correct_rate(
             h = sensors.axes[j]
             weight = 1.0 / room.variance[j]
             moment = weight * kept[j]
-            p, q, t = weight * h[0], weight * h[1], weight * h[2]
+            p = weight * h[0]
+            q = weight * h[1]
+            t = weight * h[2]
             xx += p * h[0]
             xy += p * h[1]
             xz += p * h[2]
@@ -237,9 +252,14 @@ def correct_rate(
             y += h[1] * moment
             z += h[2] * moment
             squares += moment * kept[j]
-    s, d = room.inverse, room.correction
-    s[0], s[1], s[2] = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    s[3], s[4], s[5] = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    s = room.inverse
+    d = room.correction
+    s[0] = yy * zz - yz * yz
+    s[1] = xz * yz - xy * zz
+    s[2] = xy * yz - xz * yy
+    s[3] = xx * zz - xz * xz
+    s[4] = xy * xz - xx * yz
+    s[5] = xx * yy - xy * xy
     scale = 1.0 / (xx * s[0] + xy * s[1] + xz * s[2])
     for k in range(6):
         s[k] *= scale
@@ -293,7 +313,8 @@ def whitened(
         return room.residual[i] / math.sqrt(params.residual[i, i])
     leave_out(params, sensors.n, room, i, -1, -1)
     correct_rate(sensors, sample, room, i, -1, -1)
-    h, s = sensors.axes[i], room.inverse
+    h = sensors.axes[i]
+    s = room.inverse
     own_part = h[0] * (s[0] * h[0] + 2 * (s[1] * h[1] + s[2] * h[2])) + h[1] * (
         s[3] * h[1] + 2 * s[4] * h[2]
     )
@@ -314,7 +335,8 @@ def explain(
     These are a single channel and its rivals, or else pairs, or else a whole unit, or else
     all channels (docs/methods.md#likelihood_ratio). `fill_scratch` must have been called.
     """
-    n, best = sensors.n, math.inf
+    n = sensors.n
+    best = math.inf
     for i in range(n):
         room.remaining[i] = math.inf
         if sensors.detectable[i]:
@@ -352,7 +374,8 @@ def explain_by_pairs(
     """Name the channels of all pairs that explain the sample. Return False if none does."""
     if not params.pairs:
         return False
-    n, possible = sensors.n, 0
+    n = sensors.n
+    possible = 0
     for i in range(n):
         verdict.suspects[i] = False
         room.misfit[i] = math.inf
@@ -401,14 +424,16 @@ def explain_by_units(
     verdict: SampleVerdict,
 ) -> bool:
     """Name the unit that explains the sample. Return False unless exactly one does."""
-    found, possible = -1, 0
+    found = -1
+    possible = 0
     for k in range(params.units):
         unit = params.unit[k]
         if (
             fit(params, sensors, sample, room, unit[0], unit[1], unit[2])
             <= params.unit_limit
         ):
-            found, possible = k, possible + 1
+            found = k
+            possible = possible + 1
             for place in range(3):
                 room.misfit[place] = room.estimate[place]
     if possible != 1:
@@ -454,7 +479,8 @@ def judge(
     params: Constants, room: Scratch, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
     """Judge one sample by the largest whitened residual."""
-    sensors, largest = params.sensors, 0.0
+    sensors = params.sensors
+    largest = 0.0
     fill_scratch(params.hypotheses, sensors, sample, room)
     for i in range(sensors.n):
         verdict.scores[i] = math.nan
@@ -463,7 +489,8 @@ def judge(
                 whitened(params.hypotheses, sensors, sample, room, i)
             )
             largest = max(largest, verdict.scores[i])
-    verdict.statistic, verdict.threshold = largest, params.threshold
+    verdict.statistic = largest
+    verdict.threshold = params.threshold
     verdict.alarm = largest >= params.threshold
     if verdict.alarm:
         explain(params.hypotheses, sensors, sample, room, verdict)

@@ -152,11 +152,9 @@ class SingleFaultDetector(Detector):
             self.errors,
             resting_std(self.errors, self.noise),
         )
-        params["limit"], params["sign"], params["scored"] = (
-            np.inf,
-            1.0 if largest else -1.0,
-            scored,
-        )
+        params["limit"] = np.inf
+        params["sign"] = 1.0 if largest else -1.0
+        params["scored"] = scored
         self._set_suspects(
             geometry.group_matrix & geometry.detectable, geometry.isolable
         )
@@ -171,9 +169,11 @@ class SingleFaultDetector(Detector):
     def _set_suspects(self, suspects: Mask, names: Mask) -> None:
         """Set for each named channel the suspects (n, n) and whether these isolate (n,)."""
         n = self.geometry.n
-        self._suspects, self._names = suspects, names
+        self._suspects = suspects
+        self._names = names
         params = self.constants[0]
-        params["suspects"][:n, :n], params["names"][:n] = suspects, names
+        params["suspects"][:n, :n] = suspects
+        params["names"][:n] = names
         # Rows that were prepared from the constants before are outdated.
         vars(self).pop("_rows", None)
 
@@ -202,11 +202,13 @@ class SingleFaultDetector(Detector):
 @compiled
 def worst(params: SingleFault, verdict: SampleVerdict) -> int:
     """Return the detectable channel with the worst score."""
-    named, most = -1, -math.inf
+    named = -1
+    most = -math.inf
     for i in range(params.sensors.n):
         badness = params.sign * verdict.scores[i]
         if params.sensors.detectable[i] and (named < 0 or badness > most):
-            named, most = i, badness
+            named = i
+            most = badness
     return named
 
 
@@ -274,7 +276,9 @@ def conclude(
 ) -> None:
     """Complete a verdict with scores from the named channel, statistic and threshold."""
     alarm = statistic >= threshold
-    verdict.statistic, verdict.threshold, verdict.alarm = statistic, threshold, alarm
+    verdict.statistic = statistic
+    verdict.threshold = threshold
+    verdict.alarm = alarm
     verdict.isolated = alarm and params.names[named]
     for i in range(params.sensors.n):
         suspect = alarm and params.suspects[named, i]
@@ -303,11 +307,9 @@ class WithForms(SingleFault):
 def set_forms(params: Any, forms: Array, squares: bool = False) -> None:
     """Write forms (t, n, n) into the constants."""
     terms, n, _ = forms.shape
-    params["terms"], params["squares"], params["forms"][:terms, :n, :n] = (
-        terms,
-        squares,
-        forms,
-    )
+    params["terms"] = terms
+    params["squares"] = squares
+    params["forms"][:terms, :n, :n] = forms
 
 
 @callback(WithForms, NoState, SampleInput, SampleVerdict)
@@ -322,10 +324,8 @@ def judge_sums(
     if params.paper:
         named = worst(params, verdict)
         residual = error_of(params, named, sample)
-        zero, scale = (
-            params.sensors.noise_std[named],
-            params.sensors.scale_std[named] * (sample.z[named] - residual),
-        )
+        zero = params.sensors.noise_std[named]
+        scale = params.sensors.scale_std[named] * (sample.z[named] - residual)
         conclude(
             params,
             named,
