@@ -387,8 +387,8 @@ def add_units(params: Constants, inference: Inference) -> None:
                 inference.direction[0, i] = size if inside >> i & 1 else 0.0
             odds = log_ratio(inference, n, 1, std * std)
             if odds > NO_LOG:
-                odds += params.gain_odds if way == 0 else 0.0
-                add(inference, n, 1, prior + odds, inside, True)
+                whole = way == 1 or not params.gain_is_fault
+                add(inference, n, 1, prior + odds, inside, whole)
 
 
 @compiled

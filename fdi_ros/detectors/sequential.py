@@ -432,9 +432,9 @@ class Sequential(Detector):
         Random walk of the bias of each channel, scalar or (n,), rad/s/sqrt(s).
     delay_std
         Standard deviation of the delay of one unit against another, s.
-    gain_odds
-        Prior odds of a wrong gain of a unit, relative to gyros. Gravity makes a wrong gain
-        of an accelerometer always visible, as an error of the vertical channel.
+    gain_is_fault
+        Whether a wrong gain of a unit makes its channels faulty, as it does of
+        accelerometers: gravity always shows it as an error of the vertical channel.
     louder
         Ratio of the noise variance of a channel to its largest so far, from which its
         slow noise is learned again.
@@ -457,7 +457,7 @@ class Sequential(Detector):
         confidence: float = 0.999,
         bias_walk: float | Sequence[float] = 5e-5,
         delay_std: float = 0.001,
-        gain_odds: float = 1.0,
+        gain_is_fault: bool = False,
         louder: float = math.inf,
     ) -> None:
         if not 0.5 < confidence < 1:
@@ -478,7 +478,7 @@ class Sequential(Detector):
                 "confidence": confidence,
                 "bias_walk": float(walk.max()),
                 "delay_std": delay_std,
-                "gain_odds": gain_odds,
+                "gain_is_fault": gain_is_fault,
                 "louder": louder,
             },
         )
@@ -514,7 +514,7 @@ class Sequential(Detector):
         params["nonlinearity"][:n] = np.maximum(
             noise.nonlinearity_std, LEAST_NONLINEARITY
         )
-        params["gain_odds"] = math.log(gain_odds)
+        params["gain_is_fault"] = gain_is_fault
         params["louder"] = louder
         params["rest_std"] = REST_STD
         used = all_sets(n)

@@ -110,7 +110,7 @@ class Constants:
     expected: Channels  # variance of a sample, (rad/s)^2
     timing: Channels  # standard deviation of the sampling instant of each channel, s
     louder: Real  # as of `fdi_ros.model.quantity.Quantity`
-    gain_odds: Real  # logarithm of the odds that a unit's gain is wrong, against gyros
+    gain_is_fault: Flag  # as of `fdi_ros.model.quantity.Quantity`
     # standard deviation of errors not linear in the rate, share of the rate along each
     nonlinearity: Channels
     rest_std: Real  # of the rate at rest, rad/s

@@ -19,14 +19,15 @@ class Quantity(NamedTuple):
     name: str  #: as in ``a gyro``
     unit: str
     natural: float  #: stands for 1 rad/s, in the unit
-    gain_odds: float
-    """Prior odds that the gain of a unit changes, against those of a gyro. Gravity makes any
-    change of the gain of accelerometers look like an error of the vertical one."""
+    gain_is_fault: bool
+    """Whether a wrong gain of a unit makes its channels faulty. Gyros at rest are healthy
+    whatever the gain. Gravity shows the gain of accelerometers at all times, as an error of
+    the vertical one."""
     louder: float
     """Noise variance over the largest before from which slow noise is unknown anew. Vibration
     moves an accelerometer itself: what it rectifies and folds down comes with its noise."""
 
 
-RATE = Quantity("gyro", "rad/s", 1.0, 1.0, math.inf)
+RATE = Quantity("gyro", "rad/s", 1.0, False, math.inf)
 #: 150 m/s^2 for 1 rad/s: then nothing is declared in thirty vibrating flights
-FORCE = Quantity("accelerometer", "m/s^2", 150.0, 0.01, 16.0)
+FORCE = Quantity("accelerometer", "m/s^2", 150.0, True, 16.0)

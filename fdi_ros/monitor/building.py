@@ -158,7 +158,7 @@ def _build(
     errors = {
         "bias_walk": config.noise.bias_walk,
         "delay_std": delay_std,
-        "gain_odds": quantity.gain_odds,
+        "gain_is_fault": quantity.gain_is_fault,
         "louder": quantity.louder,
     }
     options |= {option: value for option, value in errors.items() if option in accepted}

@@ -106,6 +106,23 @@ def test_the_fault_of_an_accelerometer_is_named_with_its_size(axis, seed):
     assert abs(output.residual[-1, named[0].channel]) == pytest.approx(3.0, abs=1.0)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_vertical_accelerometer_is_named_where_the_gain_of_its_unit_explains_as_much(
+    seed,
+):
+    """One tenth of gravity, in hover: of an IMU with a wrong gain the vertical accelerometer is wrong as well."""
+    block, _ = flight(1500, seed=seed, scale=0.005, size=0.05)
+    pipeline = Pipeline(settings())
+    pipeline.sense(range(3))
+    fault = "channel=imu_2.accel_z kind=bias size=0.98 start=4"
+    output = pipeline.process(struck(block, [fault], pipeline.channel_names))
+    assert [
+        output.channel_names[event.channel]
+        for event in output.events
+        if event.after.name == "FAULTY"
+    ] == ["imu_2.accel_z"]
+
+
 def test_the_fused_specific_force_is_as_far_off_as_its_covariance_says():
     squares = []
     for seed in range(6):
