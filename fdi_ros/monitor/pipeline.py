@@ -92,6 +92,8 @@ class Pipeline:
         self.quantity = quantity
         self.accelerometers: Pipeline | None = None
         """The other half; None: there are no accelerometers, or no sample has come yet that shows which."""
+        self.channel_names = self.geometry.channel_names
+        """Names of all channels, gyros first."""
         self.undecided = config.has_units and config.accelerometers.enabled == "auto"
         """Whether the first samples are to show which units have accelerometers."""
         self.felt: tuple[int, ...] = ()
@@ -116,13 +118,6 @@ class Pipeline:
             self.sense(possible_units(config, self.geometry.n))
 
     @property
-    def channel_names(self) -> tuple[str, ...]:
-        """Names of all channels, gyros first."""
-        return tuple(
-            name for half in self.halves for name in half.geometry.channel_names
-        )
-
-    @property
     def halves(self) -> tuple[Pipeline, ...]:
         """The monitor of the gyros, and that of the accelerometers if there are any."""
         return (self,) if self.accelerometers is None else (self, self.accelerometers)
@@ -138,6 +133,9 @@ class Pipeline:
         self.undecided = False
         self.felt = chosen if len(chosen) > 1 else ()
         self.accelerometers = self.build_accelerometers(chosen) if self.felt else None
+        self.channel_names = tuple(
+            name for half in self.halves for name in half.geometry.channel_names
+        )
 
     def twin(self) -> Pipeline:
         """Return another monitor with the same settings of the same channels, which has seen nothing."""
@@ -257,8 +255,9 @@ class Pipeline:
             stamps in another unit than nanoseconds.
         """
         samples = self._checked(block)
-        nothing = self._output(2 * (allocate(OutputRow, 0),), [])
-        return next(self._parts(samples, False), nothing)
+        if not len(samples):
+            return self._output((allocate(OutputRow, 0), allocate(OutputRow, 0)), [])
+        return next(self._parts(samples, False))
 
     def steps(self, block: Block) -> Iterator[Output]:
         """Judge and fuse a block as `process` does, in parts that each end at a sample with events, or at the end."""
@@ -454,7 +453,8 @@ class Pipeline:
 
     def _checked(self, block: Block) -> NDArray[Any]:
         """Return the samples of a block as the sample path takes them, (N,) `Sample`."""
-        block = self.arranged(block)
+        if self.undecided or self.accelerometers is not None:
+            block = self.arranged(block)
         stamp = np.asarray(block.stamp)
         z = np.asarray(block.z)
         n = self.geometry.n
@@ -480,7 +480,7 @@ class Pipeline:
         samples["stamp"] = stamp
         samples["z"][:, :n] = z
         samples["received"][:, :n] = True if block.received is None else block.received
-        if block.acceleration is not None:
+        if self.accelerometers is not None and block.acceleration is not None:
             force = block.acceleration
             columns = places(self.config, self.felt)
             if force.z.shape[1] != len(columns):
