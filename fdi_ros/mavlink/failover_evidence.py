@@ -19,6 +19,8 @@ from collections.abc import Sequence
 from itertools import combinations
 from typing import NamedTuple
 
+import numpy as np
+
 from fdi_ros.core.states import ChannelState
 from fdi_ros.mavlink.failover_policy import Imu
 from fdi_ros.mavlink.protocol import MS, NS, Vector
@@ -39,13 +41,13 @@ SCALE = 0.05
 SKEW = 20 * MS  #: Two IMUs may measure this far apart in time, ns.
 QUICK = 50 * MS  #: All samples of this time must differ by `LARGE` or `CLEAR`, ns,
 FEWEST = 3  #: and this number of samples.
-SIZED = 4  #: Samples over which the size in a text is averaged: all after the onset.
+SIZED = 80 * MS  #: The size in a text is averaged over this time, ns.
 WHOLE = 0.5  #: Share of the largest axis from which a second one is off as well.
 ALIKE = 0.05  #: Two IMUs agree within this share of the odd one's difference, too.
 TRUSTED = (
     2 * NS
 )  #: IMUs are trusted once all have agreed with each other for this time, ns.
-REPEATING = 5  #: A gyro that repeats one value in this number of samples is stuck,
+REPEATING = 100 * MS  #: A gyro that repeats one value for this time is stuck, ns,
 MOVED = 0.02  #: if the rate of another one has changed by this meanwhile, rad/s.
 #: States of channels that are a doubt.
 DOUBTS = {
@@ -99,6 +101,7 @@ class RawComparison:
         }
         # Samples since the value of an IMU changed, and the rates of all IMUs then.
         self._same = [0] * count
+        self._repeating = REPEATING // interval
         self._beside = [[UNKNOWN] * count] * count
         self._stuck = [False] * count
 
@@ -115,7 +118,7 @@ class RawComparison:
         self._recent[unit].append(rate)
         for other, beside in enumerate(self._beside):
             moved = math.dist(rate, beside[unit]) > MOVED
-            if other != unit and self._same[other] >= REPEATING and moved:
+            if other != unit and self._same[other] >= self._repeating and moved:
                 self._stuck[other] = True
         for pair, rows in self._pairs.items():
             if unit not in pair:
@@ -176,15 +179,12 @@ class RawComparison:
         if rows is None:
             return None
         count = len(rows)
-        columns = list(zip(*rows, strict=True))
-        mean = [sum(column) / count for column in columns]
+        mean = np.mean(rows, axis=0)
         # With one pair nothing is known of the noise.
-        scale = math.sqrt(count * (count - 1)) if count > 1 else 0.0
-        std = [
-            math.dist(column, [centre] * count) / scale if scale else math.inf
-            for column, centre in zip(columns, mean, strict=True)
-        ]
-        return Difference((mean[0], mean[1], mean[2]), (std[0], std[1], std[2]))
+        std = np.full(3, math.inf)
+        if count > 1:
+            std = np.std(rows, axis=0, ddof=1) / math.sqrt(count)
+        return Difference(tuple(mean.tolist()), tuple(std.tolist()))
 
     def _latest(
         self, unit: int, other: int, count: int, now: int
@@ -227,6 +227,7 @@ class Evidence:
         self.apart = [math.nan] * count
         self._min_size = min_size
         self._fewest = max(FEWEST, QUICK // interval + 1)
+        self._sized = SIZED // interval
         # States of the three channels of each IMU. Empty: unknown.
         self._states: list[tuple[ChannelState, ...]] = [()] * count
         self._sizes = [UNKNOWN] * count  # largest of late, by axis, rad/s
@@ -304,12 +305,14 @@ class Evidence:
             if not self._is_odd(k, units, apart):
                 accused = accused - self._outdated[k]
             is_unknown = not self._states[k] and k != odd
+            stuck = self.raw.is_stuck(k)
             imus.append(
                 Imu(
                     named=None if is_unknown else bool(faulty or k == odd),
                     blamed=any(vector[axis] >= self._min_size for axis in accused),
-                    ok=set(self._states[k]) == {ChannelState.OK},
+                    ok=set(self._states[k]) == {ChannelState.OK} and not stuck,
                     delivers=delivers[k],
+                    stuck=stuck,
                     size=max(vector),
                     agreed=agreed,
                 )
@@ -354,8 +357,11 @@ class Evidence:
     def _partners(
         self, unit: int, units: Sequence[int], out: Sequence[int]
     ) -> list[int]:
-        """Return the IMUs with which one is compared: in use or trusted, or else all."""
-        others = [k for k in units if k != unit]
+        """Return the IMUs with which one is compared: in use or trusted, or else all.
+
+        One that is stuck is no measure.
+        """
+        others = [k for k in units if k != unit and not self.raw.is_stuck(k)]
         fit = [k for k in others if k not in out or self._refuted[k] is not None]
         return fit or others
 
@@ -470,7 +476,7 @@ class Evidence:
         found = [
             (not imu.ok, difference.size, difference)
             for k, imu in enumerate(self.imus)
-            if k != unit and (difference := self.raw.between(unit, k, now, SIZED))
+            if k != unit and (difference := self.raw.between(unit, k, now, self._sized))
         ]
         if not found:
             return None

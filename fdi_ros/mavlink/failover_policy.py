@@ -26,8 +26,8 @@ Definitions
 `failover_evidence.Evidence` finds which IMUs are apart, named and blamed.
 
 Rules, in this order at each tick
-    1. Held IMUs go back in use if the operator asks, if no other IMU is left in use,
-       or if they have not been apart for a pause: `PAUSE`, doubled each time the IMU
+    1. Held IMUs go back in use if the operator asks, if no other IMU is left in use
+       that is not stuck, or if they have not been apart for a pause: `PAUSE`, doubled each time the IMU
        is taken out in a flight. In flight that needs a live monitor. On the ground an
        IMU stays out that is still named, or of which the monitor reports nothing. An IMU
        that was out when the autopilot started has no notch filters: only the operator or
@@ -89,14 +89,21 @@ class Condition(Enum):
     STUCK_OUT = "ordered back, but not reported in use"
     LEFT_ALONE = "set by somebody else in this flight, or put back by the operator"
     APART = "apart for long, while two others agree"
-    DISAGREE = "no two IMUs agree for long, and the monitor finds none OK"
+    DISAGREE = "an IMU is apart for long, armed, and the monitor finds none OK"
+    ALONE = "one IMU or none is alive, armed"
     REDUNDANT = "two or more IMUs in use, and EKF lanes that are not lost"
     LAST_IMU = "one IMU in use, or none, because of our orders"
     LAST_LANE = "one EKF lane, or none, is not lost"
 
 
 #: Announced every `REPEAT`.
-REPEATED = {Condition.DANGER, Condition.LAST_IMU, Condition.LAST_LANE}
+REPEATED = {
+    Condition.DANGER,
+    Condition.ALONE,
+    Condition.DISAGREE,
+    Condition.LAST_IMU,
+    Condition.LAST_LANE,
+}
 
 
 class PolicySettings(NamedTuple):
@@ -115,6 +122,7 @@ class Imu(NamedTuple):
     blamed: bool = False  #: Named on an axis that is apart, as defined above.
     ok: bool = False  #: The monitor finds all its channels OK.
     delivers: bool = False  #: Its samples arrive.
+    stuck: bool = False  #: They repeat one value while another IMU moves.
     size: float = float("nan")
     """Largest raw difference to the nearest IMU of late, rad/s. NaN: unknown."""
     #: Not apart from a sound IMU since this time. None: apart, stuck or unknown.
@@ -149,6 +157,7 @@ class Memory:
     acquainted: bool = False  #: Has once agreed with another IMU for `ACQUAINTED`.
     bad_since: int | None = None
     apart_since: int | None = None
+    dead_since: int | None = None  #: Stuck, or without samples, since this time.
     against_since: int | None = None  #: Since when reports contradict `seen`, ns.
     lane_angle: float = 0.0  #: Angle by which its EKF lane was misled, rad.
 
@@ -222,7 +231,12 @@ def is_bad(imu: Imu, settings: PolicySettings) -> bool:
 
 def is_sound(imu: Imu, settings: PolicySettings) -> bool:
     """Return whether the autopilot can fly with an IMU alone."""
-    return imu.delivers and (imu.ok or imu.size < settings.min_size)
+    return is_alive(imu) and (imu.ok or imu.size < settings.min_size)
+
+
+def is_alive(imu: Imu) -> bool:
+    """Return whether the samples of an IMU arrive and change."""
+    return imu.delivers and not imu.stuck
 
 
 def objection(
@@ -287,8 +301,9 @@ def decide(
     # Without a link nobody would read them.
     found = _conditions(memories, view, now, lost) if view.linked else []
     for key, condition in found:
-        if condition is Condition.FINE and memories[key].apart_since is not None:
-            # Off, but not for long, or nobody is the odd one: not the words "no fault".
+        is_fine = condition is Condition.FINE
+        if is_fine and not view.imus[key].size < settings.min_size:
+            # Off, but not for long, or nobody is the odd one, or unknown.
             continue
         usual = Condition.REDUNDANT if key == VEHICLE else Condition.FINE
         last = announced.get(key, Announced(usual, now))
@@ -328,6 +343,7 @@ def _remember(
     memory.bad_since = (memory.bad_since or now) if is_bad(imu, settings) else None
     is_off = is_apart(imu, settings)
     memory.apart_since = (memory.apart_since or now) if is_off else None
+    memory.dead_since = None if is_alive(imu) else (memory.dead_since or now)
 
 
 def _hear(memory: Memory, use: bool, heard: int) -> None:
@@ -389,7 +405,7 @@ def _note_lanes(
 def _release(memories: Sequence[Memory], view: View, now: int) -> None:
     """Rules 1 and 4: let go of IMUs that should be back in use."""
     none_left = all(
-        memory.ours or imu.use is False
+        memory.ours or imu.stuck or imu.use is False
         for memory, imu in zip(memories, view.imus, strict=True)
     )
     for memory, imu in zip(memories, view.imus, strict=True):
@@ -458,33 +474,37 @@ def _conditions(
     memories: Sequence[Memory], view: View, now: int, lanes_lost: bool
 ) -> list[tuple[int, Condition]]:
     """Return the condition of each IMU and of the vehicle: the first that applies."""
-    longest = [
-        memory.apart_since is not None and now - memory.apart_since >= UNNAMED
-        for memory in memories
-    ]
-    # Where no two agree nobody is the odd one.
-    none_agree = all(longest)
+    longest = [_has_stood(memory.apart_since, UNNAMED, now) for memory in memories]
+    # Where no two agree, or the monitor finds none OK, nobody is the odd one.
+    is_any_ok = any(imu.ok for imu in view.imus)
+    is_odd_known = is_any_ok and not all(longest)
     found = [
-        (k, _condition(memory, view.imus[k], view, now, longest[k] and not none_agree))
+        (k, _condition(memory, view.imus[k], view, now, longest[k] and is_odd_known))
         for k, memory in enumerate(memories)
     ]
+    alive = sum(not _has_stood(memory.dead_since, REACTION, now) for memory in memories)
     left = sum(memory.seen is not False for memory in memories)
     by_us = any(memory.ours and memory.seen is False for memory in memories)
     checks = (
+        (view.armed and alive <= 1, Condition.ALONE),
         (view.armed and by_us and left <= 1, Condition.LAST_IMU),
         (lanes_lost, Condition.LAST_LANE),
-        (none_agree and not any(imu.ok for imu in view.imus), Condition.DISAGREE),
+        (view.armed and any(longest) and not is_any_ok, Condition.DISAGREE),
     )
     found.append((VEHICLE, _first(checks, Condition.REDUNDANT)))
     return found
 
 
+def _has_stood(since: int | None, duration: int, now: int) -> bool:
+    return since is not None and now - since >= duration
+
+
 def _condition(
     memory: Memory, imu: Imu, view: View, now: int, apart: bool
 ) -> Condition:
-    since = (now if memory.bad_since is None else memory.bad_since) + REACTION
     is_out = memory.ours and memory.seen is False
-    is_danger = view.armed and memory.seen is not False and now >= since
+    is_bad_long = _has_stood(memory.bad_since, REACTION, now)
+    is_danger = view.armed and memory.seen is not False and is_bad_long
     asked_back = memory.ours and not memory.held and memory.tries > QUICK_TRIES
     checks = (
         (is_danger, Condition.DANGER),

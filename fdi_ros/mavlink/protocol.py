@@ -107,6 +107,30 @@ class ImuSample(NamedTuple):
     acceleration: Vector  #: m/s^2
 
 
+class Thinning:
+    """Picks samples at an interval, ns, from faster ones, the same times for all units.
+
+    Samples within a fifth of the interval of a picked one of another unit belong to
+    this one. The next are picked three quarters of the interval later.
+    """
+
+    def __init__(self, interval: int) -> None:
+        self._interval = interval
+        self._begun = 0  # stamp of the first sample of the present row, ns
+        self._units: set[int] = set()  # units in it
+
+    def picks(self, sample: ImuSample) -> bool:
+        """Return whether a sample is picked."""
+        since = sample.stamp - self._begun
+        if 4 * since >= 3 * self._interval:
+            self._begun = sample.stamp
+            self._units.clear()
+        elif 5 * abs(since) >= self._interval or sample.unit in self._units:
+            return False
+        self._units.add(sample.unit)
+        return True
+
+
 def read(number: int, payload: bytes) -> ImuSample | None:
     """Return the sample in a payload of one of `MESSAGES`, or None without a new gyro sample."""
     message = MESSAGES[number]

@@ -35,11 +35,11 @@ from fdi_ros.core.messages import (
 from fdi_ros.core.sources import ChannelsSource
 from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import ConfigError
+from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
 from fdi_ros.mavlink.failover import PARAMETERS as INS_USE
-from fdi_ros.mavlink.failover import Failover
 from fdi_ros.mavlink.failover_policy import PolicySettings
 from fdi_ros.mavlink.link import open_link, read_key
-from fdi_ros.mavlink.protocol import ImuSample, system_ahead
+from fdi_ros.mavlink.protocol import ImuSample, Thinning, system_ahead
 from fdi_ros.mavlink.report import Announcer, Reporter
 from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import (
@@ -146,6 +146,10 @@ class AutopilotNode(CheckedNode):
             "" if params["messages"] == "auto" else f"{params['messages'].upper()}_IMU"
         )
         key = read_key(params["signing_key"]) if params["signing_key"] else b""
+        self._thinning = (
+            None if params["failover"] == "off" else Thinning(round(1e9 / rate))
+        )
+        rate *= 1.0 if self._thinning is None else OVERSAMPLING
         return VehicleSettings(
             params["system_id"], params["component_id"], kind, rate, key
         )
@@ -258,6 +262,8 @@ class AutopilotNode(CheckedNode):
             for sample in self._vehicle.feed(peer, data, now):
                 if self._failover is not None:
                     self._failover.feed(sample)
+                if self._thinning is not None and not self._thinning.picks(sample):
+                    continue
                 # Topics have the time of the system.
                 stamp = sample.stamp + self._ahead
                 if sample.unit < len(self._units) and 0 <= stamp <= LAST_STAMP:

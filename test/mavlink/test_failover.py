@@ -15,11 +15,19 @@ import pytest
 
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink import failover_file
-from fdi_ros.mavlink.failover import Failover
+from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
 from fdi_ros.mavlink.failover_policy import Condition, PolicySettings
 from fdi_ros.mavlink.failover_words import WORDS
 from fdi_ros.system.clocks import Clocks
-from mavlink.autopilots import NS, PARAMETERS, UTC, Autopilot, Conversation
+from mavlink.autopilots import (
+    NS,
+    PARAMETERS,
+    UTC,
+    Autopilot,
+    Conversation,
+    Motion,
+    gentle,
+)
 from mavlink.flights import Flight
 
 MS = 1_000_000
@@ -54,7 +62,8 @@ class Monitored(Conversation):
         min_size: float = 0.03,
         **settings,
     ) -> None:
-        super().__init__(*autopilots, may_set=True, **settings)
+        rate = 50.0 * OVERSAMPLING
+        super().__init__(*autopilots, may_set=True, rate=rate, **settings)
         policy = PolicySettings(limit, min_size)
         self.failover = Failover(
             self.vehicle, CHANNELS, policy, path / "out.json", lambda: self.clocks()
@@ -266,11 +275,83 @@ def test_no_fault_is_not_said_of_an_imu_that_differs(flying: Monitored) -> None:
     flying.fault(1, 0.6, [UNCHECKED] * 3)
     flying.states[6:] = [UNCHECKED] * 3
     flying.run(10.0)
-    assert "no two IMUs agree" in flying.texts
+    assert "the IMUs disagree: land" in flying.texts
     flying.fault(1, 0.0, [UNCHECKED] * 3, seconds=4.0)
     assert not any("no fault" in text for text in flying.texts)
     flying.heal(2, 2.0)
     assert "IMU 2 (imu_2) in use, no fault" in flying.texts
+
+
+def shaken(imus: Sequence[int], frequency: float, amplitude: float) -> Motion:
+    """Return gentle motion of three IMUs, of which some vibrate about x, from 10 s on."""
+    still = gentle(3)
+
+    def rates(t: float) -> np.ndarray:
+        found = still(t)
+        phase = 2.0 * np.pi * frequency * t
+        found[[k - 1 for k in imus], 0] += amplitude * np.sin(phase) * (t > 30.0)
+        return found
+
+    return rates
+
+
+@pytest.mark.parametrize("imus", [(3,), (1, 2)])
+@pytest.mark.parametrize(
+    ("frequency", "amplitude"),
+    [(49.0, 0.1), (49.0, 0.3), (49.8, 0.3), (50.5, 0.3), (99.7, 0.1), (149.5, 0.3)],
+)
+def test_vibration_near_a_multiple_of_50_hz_is_no_error(
+    tmp_path: Path, imus: Sequence[int], frequency: float, amplitude: float
+) -> None:
+    """Each 20 ms it would be a slow error, and the monitor names IMU 3 for it."""
+    autopilot = Autopilot("ardupilot", motion=shaken(imus, frequency, amplitude))
+    talk = Monitored(tmp_path, autopilot).run(10.0)
+    autopilot.armed = True
+    talk.run(12.0)
+    assert reason(talk) == "ready"
+    talk.states[6:] = [FAULTY, OK, OK]
+    talk.run(6.0)
+    assert not autopilot.sets
+    assert not any("out of use" in text or "differs" in text for text in talk.texts)
+
+
+def test_imus_that_come_at_50_hz_are_not_ready(tmp_path: Path) -> None:
+    """Over a slow line, or another station asks for another rate."""
+    autopilot = Autopilot("ardupilot", refuses={26, 116, 129})
+    autopilot.intervals = dict.fromkeys((26, 116, 129), 20_000)
+    talk = Monitored(tmp_path, autopilot).run(15.0)
+    assert reason(talk) == "no failover: IMUs come too slowly"
+
+
+@pytest.mark.parametrize(
+    "states",
+    [
+        [OK] * 9,
+        [FAULTY] * 6 + [OK] * 3,
+        [STALE] * 6 + [UNCHECKED] * 3,
+        [UNCHECKED] * 6 + [AMBIGUOUS] * 3,
+        [OK] * 6 + [FAULTY] * 3,
+    ],
+)
+@pytest.mark.parametrize("dead", ["frozen", "silent"])
+def test_two_that_die_at_once_bring_one_true_sentence(
+    flying: Monitored, dead: str, states: list[int]
+) -> None:
+    autopilot = flying.autopilots[0]
+    if dead == "frozen":
+        motion = autopilot.motion
+        kept = motion(20.0)
+        autopilot.motion = lambda t: np.stack([kept[0], kept[1], motion(t)[2]])
+    else:
+        del autopilot.intervals[26], autopilot.intervals[116]
+        autopilot.refuses = {26, 116}
+    flying.run(0.2)
+    flying.states = states
+    flying.run(8.0)
+    assert flying.in_use[2]
+    assert "one IMU or none is alive: land" in flying.texts
+    assert not any("IMU 3" in text for text in flying.texts)
+    assert not any("no fault" in text for text in flying.texts)
 
 
 def test_an_imu_that_healed_while_the_link_was_cut_stays_in_use(

@@ -16,6 +16,8 @@ from fdi_ros.mavlink.protocol import (
     MS,
     NS,
     BootClock,
+    ImuSample,
+    Thinning,
     TimeSync,
     read,
     system_ahead,
@@ -24,6 +26,27 @@ from fdi_ros.mavlink.protocol import (
 
 OVER = (1 << 32) * MS
 SHORT = st.integers(-32768, 32767)
+
+
+@pytest.mark.parametrize("fast", [9, 18, 20, 25])
+def test_samples_picked_from_faster_ones_are_of_the_same_times(fast: int) -> None:
+    """Units come 1 ms after each other, some samples are lost, sending is late by 2 ms."""
+    random = np.random.default_rng(fast)
+    thinning = Thinning(20 * MS)
+    times: dict[int, list[int]] = {0: [], 1: [], 2: []}
+    for burst in range(2000):
+        late = int(random.integers(3))
+        for unit in times:
+            stamp = (fast * burst + late + unit) * MS
+            if random.random() > 0.1 and thinning.picks(
+                ImuSample(unit, stamp, (0.0,) * 3, (0.0,) * 3)
+            ):
+                times[unit].append(stamp - unit * MS)
+    rows = sorted({at for picked in times.values() for at in picked})
+    assert np.diff(rows).min() >= 14 * MS
+    assert all(
+        len(set(picked)) == len(picked) > 0.85 * len(rows) for picked in times.values()
+    )
 
 
 def payload_of(message) -> bytes:
