@@ -462,6 +462,30 @@ def test_of_three_clocks_the_odd_one_is_left_out_and_the_others_stay(clock, odd)
     )
 
 
+@pytest.mark.parametrize(
+    ("late", "refused"), [(0.06, False), (0.08, False), (0.13, True)]
+)
+def test_a_unit_is_ahead_only_if_it_is_so_at_one_instant(late, refused):
+    """Two of three units arrive late, s, over a link that also stops for 0.09 s.
+
+    The third unit is then 0.17 s ahead of their last stamps, and not of their clocks.
+    """
+    aligner = Alignment(3, SKEW, TIMEOUT)
+    seconds = np.arange(600) * 0.01
+    over_link = seconds + late
+    over_link[(over_link >= 3.0) & (over_link < 3.09)] = 3.09
+    arrival = np.column_stack([seconds, over_link, over_link])
+    clocks = seconds[:, None] + 0.0005 * np.arange(3)
+    order = np.argsort(arrival.ravel(), kind="stable")
+    given = through(aligner, clocks, order).delivered[:, ::3]
+    lost = [counters["jumped"] + counters["late"] for counters in aligner.counters]
+    assert lost[0] == 0
+    assert given[:, 0].all()
+    assert [count > 500 for count in lost[1:]] == [refused] * 2
+    assert (lost[1:] == [0, 0]) != refused
+    assert given.all() != refused
+
+
 @pytest.mark.parametrize("odd", [0, 1])
 @pytest.mark.parametrize("clock", [*CLOCKS][:5])
 def test_of_two_clocks_that_go_apart_none_is_believed_alone(clock, odd):

@@ -5,6 +5,7 @@
 
 import functools
 import itertools
+import math
 import re
 
 import numpy as np
@@ -21,6 +22,7 @@ from monitor.streams import (
     stream,
     told,
 )
+from scipy.spatial.transform import Rotation
 
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Reason
@@ -468,3 +470,24 @@ def test_a_value_that_stands_within_one_step_of_its_sensor_is_not_stuck(stuck):
     assert {e.channel for e in output.events if e.after == ChannelState.FAULTY} == (
         {3} if stuck else set()
     )
+
+
+@pytest.mark.parametrize("size", [0.05, 0.3])
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_value_that_repeats_beside_another_fault_widens_no_set(size, seed):
+    """imu_2.z freezes in motion and imu_1.y fails a second later: both are named.
+
+    While the alarm of one stands, the others are no witness that the other one is stuck.
+    """
+    turn = Rotation.from_rotvec(np.full(3, math.radians(30.0) / math.sqrt(3.0)))
+    mounts = [*np.eye(3).ravel(), *turn.as_matrix().ravel()]
+    pipeline = Pipeline(parallel(2, **SEQUENTIAL, imus__mounts=mounts))
+    block = stream(pipeline.geometry, 900, size=0.3, seed=seed)
+    block.z[450:, 5] = block.z[449, 5]
+    block.z[560:, 1] += size
+    found = declarations(pipeline, pipeline.process(block))
+    assert {name for name, state in found if state == "FAULTY"} == {
+        "imu_1.y",
+        "imu_2.z",
+    }
+    assert "imu_1.x" not in {name for name, _ in found}
