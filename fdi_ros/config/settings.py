@@ -582,7 +582,7 @@ class AccelerometersConfig:
     position_std: tuple[float, ...] = setting(
         (),
         "standard deviation of a position along each axis, one value for all but the first, or one per place; empty:"
-        " 0.02 without positions, else 0",
+        " 0.05 without positions, else 0",
         "m",
         0.0,
         10.0,

@@ -45,8 +45,12 @@ def give_sample(core: Core, gyros: Core, sample: Sample, half: int) -> None:
         if settings.lever:
             take_off_lever_arms(core, gyros, given.z)
         follow_turn(core.turning, gyros.last.rate, sample.stamp)
+        for a in range(3):
+            core.sample.spin[a] = core.turning.newest[a]
         for i in range(settings.n):
             given.z[i] /= settings.natural
+            std = math.sqrt(settings.position_variance[i])
+            core.sample.position_std[i] = std / settings.natural
             core.sample.displaced[i] = displaced_variance(core, i)
 
 
@@ -58,6 +62,7 @@ def follow_turn(turning: Turning, rate: Vector, stamp: int) -> None:
     if not math.isfinite(rate[0]):
         return
     for a in range(3):
+        turning.newest[a] = rate[a]
         step = rate[a] - turning.rate[a]
         turning.rate[a] += step * min(since / TURN_TIME, 1.0)
         turning.acceleration[a] = step / TURN_TIME if since < TURN_TIME else 0.0

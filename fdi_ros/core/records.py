@@ -211,6 +211,10 @@ class SampleInput:
     bias_std: Channels  # standard deviation of each channel's initial bias, rad/s
     # variance by the unknown positions of accelerometers in the present turn, (rad/s)^2
     displaced: Channels
+    # rate of the body beside that, from the gyros, rad/s
+    spin: Vector
+    # standard deviation of the positions, m over the natural size of the quantity
+    position_std: Channels
     interrupted: Flag  # a hole in the stream precedes this sample
     held: Flag  # a manoeuvre has just driven a channel out of range: evidence is void
     repeated: Flag  # a unit repeats old values while the others move: no evidence
@@ -446,6 +450,7 @@ class Turning:
     stamp: Whole  # of the last sample, ns
     rate: Vector  # fused rate through a low pass of the first order, rad/s
     acceleration: Vector  # its derivative, rad/s^2
+    newest: Vector  # fused rate of the last sample that had one, rad/s
 
 
 @record

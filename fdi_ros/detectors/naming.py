@@ -33,6 +33,7 @@ from fdi_ros.compiling.compiled import (
 from fdi_ros.core.algebra import along, dot, dot_in, invert
 from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity
 from fdi_ros.core.records import Matrix, Parity
+from fdi_ros.estimator.displacement import add_displacement_of_mean
 from fdi_ros.estimator.error_states import (
     SIGNALS,
     SPEED,
@@ -214,11 +215,12 @@ def add_noise(
         speed = moves * (kf.total.speed[i] - inference.before.speed[i]) / size
         bent = params.nonlinearity[i] * speed
         inference.covariance[i, i] += noise + kf.peak_extra[i] * part + bent * bent
-        inference.covariance[i, i] += kf.displaced[i]
+        inference.covariance[i, i] += kf.displaced[i] * part
         place = params.layout.delays[params.unit[i]]
         if place >= 0:
             swing = moves * kf.peak_turn[i] * part
             inference.covariance[i, i] += kf.states.p[place, place] * swing * swing
+    add_displacement_of_mean(params, kf, inference.before, size, inference.covariance)
 
 
 @compiled

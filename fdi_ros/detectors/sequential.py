@@ -38,7 +38,6 @@ from fdi_ros.detectors.sums import (
 )
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.blocks import (
-    follow_displacement,
     judge_block,
     learn,
     predict_innovation_covariance,
@@ -46,6 +45,7 @@ from fdi_ros.estimator.blocks import (
     update_excess,
 )
 from fdi_ros.estimator.delays import transfer_delays, update_time_offsets
+from fdi_ros.estimator.displacement import close_turn, follow_displacement
 from fdi_ros.estimator.error_states import (
     begin_states,
     fill_signals,
@@ -162,6 +162,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     """Process a complete block: noise, states, and evidence on the longer time scales."""
     kf, case, n = state.estimator, state.case, params.sensors.n
     noise, learns = kf.noise, not case.open
+    close_turn(params, kf)
     update_largest_rate(
         noise, kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
     )
@@ -276,7 +277,7 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
         # No block gives the motion yet, but the sample does.
         project(params.layout, kf.states, kf.at)
         update_weights(params, kf)
-    follow_displacement(params, kf, sample.displaced)
+    follow_displacement(params, kf, sample)
     update_statistics(params, kf)
     find_outliers(params, kf, sample.z)
     if kf.judged == 0:

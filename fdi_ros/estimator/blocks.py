@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 
-from fdi_ros.compiling.compiled import Channels, compiled
+from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.algebra import dot_in, variance_along
 from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity, fill_parity
 from fdi_ros.core.subsets import number_in
+from fdi_ros.estimator.displacement import add_displacement_of_block
 from fdi_ros.estimator.error_states import (
     ONE,
     RATE_X,
@@ -39,8 +40,6 @@ TURNING = 20.0
 for motion would teach delays of zero."""
 # share of a channel's own error in its residual, below which no method judges it
 LEAST_REDUNDANCY = 1e-3
-# variance by unknown positions over that of the noise, from which it counts at once
-DISPLACED = 0.1
 PEAK = 0.8  # decay of a motion peak per block: gone after half a second
 
 
@@ -144,7 +143,8 @@ def judge_block(params: Constants, kf: Estimator) -> float:
         for j in range(n):
             kf.matrix[i, j] = kf.block_at.covariance[i, j]
         kf.block_noise[i] = noise.now.block[i] * noise.longest[i] / params.length
-        kf.matrix[i, i] += kf.block_noise[i] + kf.extra[i] + kf.displaced[i]
+        kf.matrix[i, i] += kf.block_noise[i] + kf.extra[i]
+    add_displacement_of_block(params, kf, kf.matrix)
     fill_joint_parity(kf.block_parity, params.sensors, mask, kf.matrix, UNKNOWN_RATE)
     subtract_errors(
         layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation
@@ -306,22 +306,6 @@ def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
         kf.allowed[i] = kf.displaced[i]
         kf.at.covariance[i, i] += kf.peak_extra[i] + kf.displaced[i]
     kf.speed_squared = kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
-    update_weights(params, kf)
-
-
-@compiled
-def follow_displacement(params: Constants, kf: Estimator, displaced: Channels) -> None:
-    """Follow the variance by unknown positions (n,), (rad/s)^2; a turn that begins counts at once."""
-    n, begins = params.sensors.n, False
-    for i in range(n):
-        kf.displaced[i] = max(kf.displaced[i], displaced[i])
-        lasting = 2.0 * params.length * (kf.displaced[i] - kf.allowed[i])
-        begins = begins or lasting > DISPLACED * kf.noise.now.sample[i]
-    if not begins:
-        return
-    for i in range(n):
-        kf.at.covariance[i, i] += kf.displaced[i] - kf.allowed[i]
-        kf.allowed[i] = kf.displaced[i]
     update_weights(params, kf)
 
 

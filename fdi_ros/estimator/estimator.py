@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from fdi_ros.compiling.compiled import (
     MAX_CHANNELS,
     MAX_UNITS,
+    Axes,
     Channels,
     Counts,
     Flag,
@@ -37,7 +38,7 @@ from fdi_ros.compiling.compiled import (
 )
 from fdi_ros.core.algebra import along, dot, quadratic, residual, square, variance_along
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, fill_joint_parity, fill_parity
-from fdi_ros.core.records import Parity, Sensors
+from fdi_ros.core.records import Matrix, Parity, Sensors
 from fdi_ros.estimator.error_states import (
     ErrorStates,
     Layout,
@@ -132,6 +133,8 @@ class Total:
     rate: Vector  # rad/s
     speed: Channels  # absolute rate along each channel, rad/s
     instant: Vector  # rate of that sample alone, rad/s
+    turned: Matrix  # centripetal part of the displacement, rad^2/s^2
+    spin: Vector  # rate of the gyros in that sample, rad/s
 
 
 @record
@@ -240,6 +243,17 @@ class Estimator:
     peak_extra: Channels  # lately largest, (rad/s)^2
     bent: Channels  # variance by nonlinearity, lately largest, (rad/s)^2
     displaced: Channels  # variance by unknown positions, lately largest, (rad/s)^2
+    may_be_apart: Flag  # positions of accelerometers are not known
+    position_std: Channels  # of them, m over the natural size
+    spin_sum: Vector  # of the block being filled, rad/s
+    spins: Rates  # means of the last three blocks, rad/s
+    # while a covariance by unknown positions is worked out: angular acceleration, what
+    # a block does not resolve of it, rad/s^2, centripetal part, rad^2/s^2, and effect on
+    # each channel, rad/s
+    spin_change: Vector
+    unresolved: Vector
+    turned: Matrix
+    displacement: Axes
     allowed: Channels  # that much of it is in the covariance of samples
     rest_rates: Window  # of the last blocks, rad/s
     rest_noise: Vector  # variance of the rate of a block, (rad/s)^2
@@ -392,6 +406,9 @@ def copy_total(n: int, source: Total, target: Total) -> None:
         target.speed[i] = source.speed[i]
     for a in range(3):
         target.rate[a], target.instant[a] = source.rate[a], source.instant[a]
+        target.spin[a] = source.spin[a]
+        for b in range(3):
+            target.turned[a, b] = source.turned[a, b]
 
 
 @compiled
@@ -520,7 +537,7 @@ def drop_block(kf: Estimator, n: int) -> None:
     for i in range(n):
         kf.sum_values[i] = kf.sum_count[i] = kf.sum_time[i] = 0.0
     for a in range(3):
-        kf.sum_rate[a] = 0.0
+        kf.sum_rate[a] = kf.spin_sum[a] = 0.0
 
 
 @compiled

@@ -23,8 +23,9 @@ from fdi_ros.model.samples import Array, Block
 #: specific force and its change for which the level after one more loss is foretold,
 #: m/s^2 and m/s^3
 FORETOLD_FORCE, FORETOLD_CHANGE = 20.0, 200.0
-#: standard deviation of a position along an axis where none is given, m
-UNKNOWN_POSITION = 0.02
+#: standard deviation of a position along an axis where none is given, m: units of a
+#: vehicle are up to 10 cm apart
+UNKNOWN_POSITION = 0.05
 
 
 def possible_units(config: Config, gyros: int) -> range:

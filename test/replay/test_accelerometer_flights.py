@@ -23,16 +23,20 @@ from fdi_ros.replay.run import assumed_config, replay
 from fdi_ros.replay.words import summary_text
 
 SITL = Path(__file__).parents[3] / "shared" / "data" / "sitl"
-SOLO = SITL.parent / "logs" / "solo_log171_start.bin"
+LOGS = SITL.parent / "logs"
+SOLO = LOGS / "solo_log171_start.bin"
 BEGINS = 55.13  # clock of the autopilot at the first message, s
 TOLD = 1.0  # a fault is told of for so long after its end, s
 in_sitl = pytest.mark.skipif(
     not SITL.is_dir(), reason=f"needs the recordings in {SITL}"
 )
+in_logs = pytest.mark.skipif(
+    not LOGS.is_dir(), reason=f"needs the recordings in {LOGS}"
+)
 
 
 @in_sitl
-@pytest.mark.parametrize(("position_std", "least"), [(0.0, 6), (0.02, 5)])
+@pytest.mark.parametrize(("position_std", "least"), [([0.0], 6), ([], 5)])
 def test_every_fault_of_the_simulated_flight_is_named_or_held_in_a_set_and_none_wrong(
     position_std, least
 ):
@@ -66,13 +70,32 @@ def test_every_fault_of_the_simulated_flight_is_named_or_held_in_a_set_and_none_
     }
 
 
-@pytest.mark.skipif(not SOLO.is_file(), reason=f"needs the recording {SOLO}")
+@in_logs
 def test_vibration_that_one_accelerometer_rectifies_at_take_off_declares_nothing():
     """For three seconds its noise is ten times as large, and its mean off by 2.5 m/s^2."""
     summary = replay(SOLO)
     assert not summary.story.episodes
     channels = {one.name: one for one in summary.monitor.channels}
     assert channels["imu_2.accel_z"].checked > 0.9
+
+
+@in_logs
+@pytest.mark.parametrize(
+    ("log", "channel", "start"),
+    [
+        ("quad_20mm_cut_straight", "imu_2.accel_y", 52),
+        ("quad_5mm_cut_hover", "imu_0.accel_y", 37),
+    ],
+)
+def test_a_bias_is_named_in_hover_that_shakes_units_whose_positions_are_not_known(
+    log, channel, start
+):
+    """Of 0.5 m/s^2: what the turns to and fro add by 5 cm is as large, and leaves little in a mean."""
+    fault = f"channel={channel} kind=bias size=0.5 start={start}"
+    summary = replay(LOGS / f"{log}.bin", None, [fault])
+    (outcome,) = summary.scores.faults
+    assert (outcome.outcome, outcome.channels) == ("named", (channel,))
+    assert outcome.isolation_delay_s < 10.0
 
 
 @in_sitl
