@@ -92,10 +92,10 @@ def test_without_settings_units_that_are_turned_are_refused(flight):
 def test_the_bundled_crash_needs_no_settings(root):
     result = fdi_ros.replay(root / "bags" / "copter_crash.tlog")
     [fault] = result.story.declared
-    assert fault.channels == ("imu_0.x",)
+    assert fault.channels == ("imu_1.x",)
     table = result.to_pandas()
     named = table[table["state"] == "FAULTY"]
-    assert named["channel"].tolist() == ["imu_0.x"]
+    assert named["channel"].tolist() == ["imu_1.x"]
     # Its first message, and the fault 12.96 s later.
     onset = pandas.Timestamp("2026-11-23 17:10:06.268", tz="UTC") + pandas.Timedelta(
         12.96, "s"

@@ -31,6 +31,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.flight_log import FlightLog, ImuSamples, Portion, Source, imu_samples
 from fdi_ros.bag.raw import MOST_SHOWN, Damage
 from fdi_ros.errors import BagError
@@ -123,6 +124,10 @@ class CsvLog(FlightLog):
     slowest = 5.0
     #: number of the first IMU
     first = 0
+
+    def find_context(self) -> FlightContext:
+        """Return nothing: a table has rates and accelerations only."""
+        return FlightContext()
 
     def portions(self) -> Iterator[Portion]:
         """Read the table from its start up to `end`."""

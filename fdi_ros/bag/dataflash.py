@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_log import (
     FLU,
+    LARGEST_DEVICE,
     FlightLog,
     ImuSamples,
     Portion,
@@ -47,6 +48,7 @@ from fdi_ros.bag.flight_log import (
     per_time,
     possible_start,
 )
+from fdi_ros.bag.modes import ardupilot_mode
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.model.samples import Array, Bytes, Int
 
@@ -86,6 +88,8 @@ _NUMBERS = "bBdfghHiIqQ"
 _TYPES_OF = {
     "Message": "Z",
     "Label": "Z",
+    "Name": "N",
+    "ModeNum": "B",
     "UnitIds": "N",
     "MultIds": "N",
     "I": "B",
@@ -105,6 +109,16 @@ _TEXTS = {
     "MSG": ("Message",),
     "ERR": ("Subsys", "ECode"),
 }
+#: columns of the flight: number of the mode, output of the throttle, parameters
+_FLIGHT = {
+    "MODE": ("ModeNum",),
+    "CTUN": (),
+    "PARM": ("Name", "Value"),
+}
+_THROTTLE = ("ThO", "ThrOut")
+_TEMPERATURE = ("T", "Temp")
+_DEVICE = re.compile(r"INS_GYR([23]?)_ID")
+_VEHICLE = re.compile(r"(?:Ardu|APM:)(Copter|Plane|Rover|Sub)\b")
 _UNITS = {
     "FMTU": ("FmtType", "UnitIds", "MultIds"),
     "UNIT": ("Id", "Label"),
@@ -122,6 +136,9 @@ _OPTIONAL = (
     "GWk",
     "Week",
     "DelvT",
+    "Temp",
+    "ThO",
+    "ThrOut",
 )
 _EKF_PRIMARY = 24
 _SUBSYSTEMS: dict[Any, str] = (
@@ -223,6 +240,7 @@ class DataflashLog(FlightLog):
         " If the board has more, check INS_ENABLE_MASK"
     )
     counted_by = "IMU"
+    first_imu = 1
 
     def portions(self) -> Iterator[Portion]:
         """Read the log from its start up to `end`."""
@@ -236,6 +254,7 @@ class DataflashLog(FlightLog):
             int, list[str]
         ] = {}  # all columns of each message that is read
         self._told: dict[str, dict[int, list[Any]]] = {name: {} for name in _UNITS}
+        self._vehicle = ""
         offset = lost = 0
         while True:
             self.file.seek(offset)
@@ -293,17 +312,25 @@ class DataflashLog(FlightLog):
                 samples += _samples(
                     source, rows, begin + starts[k], *self._factors(k, source)
                 )
-            elif name in _UNITS:
-                number, *columns = (rows[column] for column in _UNITS[name])
-                for at, *told in zip(
-                    number.astype(np.int64).tolist(), *map(list, columns), strict=True
-                ):
-                    self._told[name].setdefault(at, told)
-            elif name in _TEXTS:
-                self._take_texts(name, rows)
-            elif self.start_utc is None:
-                self.start_utc = _start_utc(rows)
+                self._take_temperatures(source, rows)
+            else:
+                self._take(name, rows)
         return samples, int(end), int(lost)
+
+    def _take(self, name: str, rows: Rows) -> None:
+        """Take records (k,) of a message without rates."""
+        if name in _UNITS:
+            number, *columns = (rows[column] for column in _UNITS[name])
+            for at, *told in zip(
+                number.astype(np.int64).tolist(), *map(list, columns), strict=True
+            ):
+                self._told[name].setdefault(at, told)
+        elif name in _TEXTS:
+            self._take_texts(name, rows)
+        elif name in _FLIGHT:
+            self._take_flight(name, rows)
+        elif self.start_utc is None:
+            self.start_utc = _start_utc(rows)
 
     def _describe(self, content: bytes) -> None:
         """Take a FMT record, unless an earlier one defined the same message."""
@@ -315,7 +342,7 @@ class DataflashLog(FlightLog):
             return
         self._names[number] = name
         sensor = _SENSORS.fullmatch(name)
-        if sensor or _GPS.fullmatch(name) or name in _TEXTS or name in _UNITS:
+        if sensor or _GPS.fullmatch(name) or name in {**_TEXTS, **_UNITS, **_FLIGHT}:
             self._columns[number] = columns.split(",")
             try:
                 self._layouts[number] = _layout(
@@ -331,6 +358,9 @@ class DataflashLog(FlightLog):
             texts = [
                 text.decode("ascii", "replace") for text in rows["Message"].tolist()
             ]
+            self._vehicle = self._vehicle or next(
+                (found[1] for found in map(_VEHICLE.match, texts) if found), ""
+            )
         else:
             texts = list(
                 map(_error_text, rows["Subsys"].tolist(), rows["ECode"].tolist())
@@ -338,6 +368,53 @@ class DataflashLog(FlightLog):
         if {"TimeUS", "TimeMS"} & set(rows.dtype.names or ()):
             for stamp, text in zip(_stamp(rows).tolist(), texts, strict=True):
                 self.add_text(stamp, name, text)
+
+    def origin(self, source: Source) -> str:
+        """Return the message of a source: IMU[1], or IMU2 where each has its own."""
+        if source.instance and f"{source.kind}{source.instance + 1}" in self.counts:
+            return f"{source.kind}{source.instance + 1}"
+        numbered = any(
+            "I" in (layout.names or ())
+            for k, layout in self._layouts.items()
+            if self._names[k] == source.kind
+        )
+        return f"{source.kind}[{source.instance}]" if numbered else source.kind
+
+    def mode_name(self, mode: str) -> str:
+        """Return the name of a mode, for this vehicle."""
+        return ardupilot_mode(self._vehicle, int(mode))
+
+    def _take_temperatures(self, source: Source, rows: Rows) -> None:
+        """Take the temperatures in records (k,) of IMUs."""
+        columns = set(rows.dtype.names or ())
+        name = next((one for one in _TEMPERATURE if one in columns), "")
+        if source.kind != "IMU" or not name:
+            return
+        stamp = _stamp(rows)
+        instance = rows["I"] if "I" in columns else np.full(len(rows), source.instance)
+        for k in np.unique(instance).tolist():
+            own = instance == k
+            self.add_temperature(k, stamp[own], rows[name][own])
+
+    def _take_flight(self, name: str, rows: Rows) -> None:
+        """Take modes, throttle and ids of gyros from records (k,)."""
+        columns = set(rows.dtype.names or ())
+        if name == "PARM":
+            for text, value in zip(
+                rows["Name"].tolist(), rows["Value"].tolist(), strict=True
+            ):
+                found = _DEVICE.fullmatch(text.decode("ascii", "replace"))
+                if found and 0 < value < LARGEST_DEVICE:
+                    self.devices[int(found[1] or 1) - 1] = int(value)
+        elif not {"TimeUS", "TimeMS"} & columns:
+            return
+        elif name == "MODE":
+            for stamp, number in zip(
+                _stamp(rows).tolist(), rows["ModeNum"].tolist(), strict=True
+            ):
+                self.add_mode(stamp, str(number))
+        elif column := next((one for one in _THROTTLE if one in columns), ""):
+            self.throttle.add(_stamp(rows), rows[column])
 
     def _factors(self, number: int, source: Source) -> Iterator[Array]:
         """Return the factors of rate and acceleration, (3,) each, to rad, m and s."""
@@ -380,7 +457,7 @@ def _layout(
     sensor = _SENSORS.fullmatch(name)
     rate, acceleration = _VALUES[sensor[1]] if sensor else ((), ())
     needed = {
-        *{**_TEXTS, **_UNITS}.get(name, rate),
+        *{**_TEXTS, **_UNITS, **_FLIGHT}.get(name, rate),
         *(["DelaT"] if sensor and sensor[1] == "IMT" else []),
     }
     fields: dict[str, tuple[str, int]] = {}

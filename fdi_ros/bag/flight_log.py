@@ -5,8 +5,9 @@
 
 A log is walked twice in portions: first to find the IMUs, their sample rates and the
 date, then to read. A format turns a portion into samples. This module turns samples
-into sensor_msgs/msg/Imu messages on ``/imu_0``, ``/imu_1`` and so on, by the instances
-of the log, whatever the logged message.
+into sensor_msgs/msg/Imu messages on ``/imu_1``, ``/imu_2`` and so on, whatever the logged
+message. The number is the one that the pilot sees: ArduPilot counts IMUs from 1 in its
+messages and parameters (INS_USE2, SCALED_IMU2), PX4 from 0 (CAL_GYRO0_ID).
 
 Flight stacks use body axes front, right, down (FRD), messages front, left, up (FLU,
 REP-103). Stamps count from the start of the autopilot. With GPS time in the log, the
@@ -18,7 +19,7 @@ from __future__ import annotations
 
 import re
 from abc import abstractmethod
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -28,6 +29,15 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.bag.flight_context import (
+    COLDEST,
+    HOTTEST,
+    MOST_MODES,
+    Course,
+    FlightContext,
+    Mode,
+    Thinned,
+)
 from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, LogText, Topic
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
@@ -64,6 +74,11 @@ _MOST_COMPARED = 16
 _MOST_NAMES = 6
 #: board and its serial number, as ArduPilot sends both at its start
 _BOARD = re.compile(r"[\w-]+ ([0-9A-F]{8} [0-9A-F]{8} [0-9A-F]{8})")
+#: ids of devices have 32 bits
+LARGEST_DEVICE = 1 << 32
+#: full throttle, by the message: 1, per cent, or thousandths in old logs
+_FULL = (1.0, 100.0, 1000.0)
+_MOST_THROTTLE = 1500.0
 #: texts of a log that are kept: the first ones
 _MOST_TEXTS = 1000
 
@@ -211,6 +226,8 @@ class FlightLog(BagFile):
     """Lowest usable rate of an IMU, Hz: fewer samples show too little of the motion."""
     #: one has nothing to be compared with
     fewest_imus: ClassVar[int] = 2
+    #: number of instance 0 in messages and parameters of the autopilot
+    first_imu: ClassVar[int] = 0
     #: kind of message with means of the rate, read where nothing better is there
     coarse: ClassVar[str] = ""
     counted_by: ClassVar[str] = ""
@@ -240,9 +257,10 @@ class FlightLog(BagFile):
             one._replace(stamp=self._log_time(one.stamp)) for one in self.said
         )
         self.topics = tuple(
-            Topic(_topic(one), IMU, count=self._tracks[one].count)
+            Topic(self._topic(one), IMU, count=self._tracks[one].count)
             for one in self._sources
         )
+        self.context = self.find_context()
         self.start_time = self._log_time(self._starts[0])
 
     def begin(self) -> None:
@@ -257,6 +275,12 @@ class FlightLog(BagFile):
         )
         self.hardware_id = ""
         self.said: list[LogText] = []  # texts of the autopilot up to here, stamps in us
+        self.modes: list[Mode] = []  # changes of the flight mode, stamps in us
+        self.throttle = Thinned(0.0, _MOST_THROTTLE)
+        self.temperatures: defaultdict[int, Thinned] = defaultdict(
+            lambda: Thinned(COLDEST, HOTTEST)
+        )  # of each instance, degC
+        self.devices: dict[int, int] = {}  # device id of the gyro of each instance
 
     @abstractmethod
     def portions(self) -> Iterator[Portion]:
@@ -270,16 +294,66 @@ class FlightLog(BagFile):
         if len(self.said) < _MOST_TEXTS and (line := " ".join(text.split())):
             self.said.append(LogText(stamp, kind, line))
 
+    def add_mode(self, stamp: int, name: str) -> None:
+        """Take the flight mode at a time, us."""
+        changed = not self.modes or self.modes[-1].name != name
+        if changed and len(self.modes) < MOST_MODES:
+            self.modes.append(Mode(stamp, name))
+
+    def add_temperature(
+        self, instance: int, stamp: NDArray[Any], value: NDArray[Any]
+    ) -> None:
+        """Take temperatures of an IMU (k,), degC, at stamps (k,), us."""
+        if instance in self.temperatures or len(self.temperatures) < _MOST_COMPARED:
+            self.temperatures[instance].add(stamp, value)
+
+    def origin(self, source: Source) -> str:
+        """Return the message and instance of a source, as the log names them."""
+        return f"{source.kind} {source.instance}"
+
+    def mode_name(self, mode: str) -> str:
+        """Return the name of a mode that was taken."""
+        return mode
+
+    def _topic(self, source: Source) -> str:
+        return f"/imu_{source.instance + self.first_imu}"
+
+    def find_context(self) -> FlightContext:
+        """Return what was found beside the rates, with times of recording."""
+        origins: dict[str, str] = {}
+        temperatures: dict[str, Course] = {}
+        for source in self._sources:
+            topic, device = self._topic(source), self.devices.get(source.instance)
+            named = "" if device is None else f", device {device}"
+            origins[topic] = f"{self.origin(source)}{named}"
+            course = self.temperatures[source.instance].course(self._shift)
+            # Autopilots log 0 where an IMU has no thermometer.
+            if course is not None and course.value.any():
+                temperatures[topic] = course
+        throttle = self.throttle.course(self._shift)
+        if throttle is not None:
+            peak = float(throttle.value.max())
+            full = next((one for one in _FULL if peak <= 1.5 * one), _FULL[-1])
+            throttle = throttle._replace(value=throttle.value / full)
+        modes = tuple(
+            Mode(self._log_time(one.stamp), self.mode_name(one.name))
+            for one in self.modes
+        )
+        return FlightContext(origins, temperatures, throttle, modes)
+
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics, those of a portion in the order of their stamps."""
-        sources = [source for source in self._sources if _topic(source) in topics]
+        sources = [source for source in self._sources if self._topic(source) in topics]
         if not sources:
             return
         # The frame_id of an instance has up to eight bytes with its end: all messages are equally long.
         templates = np.stack(
-            [ImuTemplate(_topic(source).removeprefix("/")).bytes for source in sources]
+            [
+                ImuTemplate(self._topic(source).removeprefix("/")).bytes
+                for source in sources
+            ]
         )
-        number = np.array([topics.index(_topic(source)) for source in sources])
+        number = np.array([topics.index(self._topic(source)) for source in sources])
         for (portion, progress), later in zip(
             self.portions(), [*self._starts[1:], NO_HORIZON], strict=False
         ):
@@ -423,7 +497,7 @@ class FlightLog(BagFile):
                     f"is logged {track.figures}, expected at least {self.slowest:g} Hz"
                 )
                 self.note(
-                    f"{kind} {source.instance} {few if track.count < track.fewest else slow}, and was left out"
+                    f"{self.origin(source)} {few if track.count < track.fewest else slow}, and was left out"
                 )
         return sorted(
             source
@@ -498,10 +572,6 @@ def _logged(kind: str, tracks: Sequence[Track]) -> str:
     return (
         f"{kind} of {len(tracks)} IMU{'s' * (len(tracks) > 1)} {fastest.figures}{few}"
     )
-
-
-def _topic(source: Source) -> str:
-    return f"/imu_{source.instance}"
 
 
 def _encoded(data: Bytes, stamp: Int, samples: ImuSamples) -> Bytes:

@@ -17,6 +17,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Bytes, Int
 from fdi_ros.system.files import FILES, open_regular
@@ -164,6 +165,8 @@ class BagFile(ABC):
     #: time of the first message, ns, or `NO_HORIZON`
     start_time: int
     texts: tuple[LogText, ...] = ()
+    #: temperatures, throttle, flight modes
+    context: FlightContext = FlightContext()
     #: serial number of the board of the autopilot, empty if the file has none
     hardware_id: str = ""
     #: MAVLink system of the autopilot, None if the file has none

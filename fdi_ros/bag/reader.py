@@ -19,6 +19,7 @@ import zstandard
 from fdi_ros import __version__
 from fdi_ros.bag.csv_file import CsvLog, CsvUnit, is_table_of_gyros, unit_numbers
 from fdi_ros.bag.dataflash import DataflashLog
+from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.mcap_file import McapFile
 from fdi_ros.bag.raw import (
     MADE_BY_FDI,
@@ -135,6 +136,12 @@ class Recording:
     def texts(self) -> tuple[LogText, ...]:
         """Texts of the autopilot in a flight log, in order, with times of recording, ns."""
         return tuple(sorted(text for file in self._files for text in file.texts))
+
+    @property
+    def context(self) -> FlightContext:
+        """Temperatures, throttle and flight modes of a flight log."""
+        found = (file.context for file in self._files if file.context.origins)
+        return next(found, FlightContext())
 
     @property
     def hardware_id(self) -> str:

@@ -13,6 +13,8 @@ autopilot's own. UTC comes from the message with the least delay.
 from __future__ import annotations
 
 import contextlib
+import math
+import re
 import struct
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -21,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.flight_log import (
+    LARGEST_DEVICE,
     ImuSamples,
     Portion,
     Source,
@@ -28,12 +31,15 @@ from fdi_ros.bag.flight_log import (
     possible_start,
 )
 from fdi_ros.bag.library_log import Columns, LibraryLog
+from fdi_ros.bag.modes import VEHICLES, ardupilot_mode, px4_heartbeat_mode
 from fdi_ros.mavlink.protocol import (
+    ARDUPILOT,
     MESSAGES,
     MOST_UNITS,
     NO_AUTOPILOT,
     RAW,
     SCALED,
+    numbers,
     read,
     understood,
 )
@@ -44,17 +50,23 @@ from fdi_ros.system.files import (
 )
 
 _HEARTBEAT, _AUTOPILOT_VERSION, _STATUSTEXT = 0, 148, 253
+_PARAM_VALUE, _VFR_HUD = 22, 74
+_BESIDE = (_HEARTBEAT, _PARAM_VALUE, _VFR_HUD, _STATUSTEXT, _AUTOPILOT_VERSION)
+"""Messages that are read beside the rates."""
+_DEVICE = re.compile(r"INS_GYR([23]?)_ID")
 _AUTOPILOT_COMPONENT = 1
 #: first bytes of messages of MAVLink 1 and 2
 _MARKS = (0xFE, 0xFD)
 _TIME = 8
 #: bytes of the shortest record
 _LEAST = _TIME + 8
+#: messages beside the rates that are kept: the first ones
+_MOST_BESIDE = 100_000
 _MAX_DELAY_SPREAD = 3_600_000_000
 """Delay relative to the median at which the time of a message is damaged, us."""
 #: largest time, us
 _LATEST = 1 << 53
-_ROW = struct.Struct("=3q6d")
+_ROW = struct.Struct("=3q7d")
 _COLUMNS = np.dtype(
     [
         ("stamp", "i8"),
@@ -62,6 +74,7 @@ _COLUMNS = np.dtype(
         ("end", "i8"),
         ("rate", "f8", 3),
         ("acceleration", "f8", 3),
+        ("temperature", "f8"),
     ]
 )
 """Of each sample, with the time at which its message came, us since 1970."""
@@ -78,6 +91,7 @@ class Tlog(LibraryLog):
         "one IMU cannot be checked: this autopilot sent no other ({}). If the board has more, it should send"
         " SCALED_IMU2 and SCALED_IMU3; for ArduPilot, check INS_ENABLE_MASK"
     )
+    first_imu = 1
     #: many ground stations ask for no more than 10 Hz
     slowest = 5.0
     most = TLOG_BYTES
@@ -88,33 +102,20 @@ class Tlog(LibraryLog):
 
         The first autopilot with a HEARTBEAT is chosen, or else the first with an IMU.
         """
-        found: defaultdict[Source, bytearray] = defaultdict(bytearray)
-        texts: list[tuple[int, str]] = []
         if (chosen := self._autopilot(data)) is None:
             return {}
-        system, autopilot = chosen
-        self.system = system
-        for at, end, message in self._messages(
-            data, (*MESSAGES, _STATUSTEXT, _AUTOPILOT_VERSION)
-        ):
-            if message.get_srcSystem() != system:
+        self.system, autopilot = chosen
+        found: defaultdict[Source, bytearray] = defaultdict(bytearray)
+        beside: list[tuple[int, Any]] = []
+        for at, end, message in self._messages(data, (*MESSAGES, *_BESIDE)):
+            if message.get_srcSystem() != self.system:
                 continue
             came = int.from_bytes(data[at : at + _TIME], "big")
-            number = message.get_msgId()
-            if number not in MESSAGES:
-                self._take_words(number, message, came, texts)
-                continue
-            kind = MESSAGES[number].kind
-            if not understood(kind, autopilot):
-                continue
-            self.counts[kind] += 1
-            start = at + _TIME
-            payload = start + (10 if data[start] == 0xFD else 6)
-            reading = read(number, data[payload : payload + data[start + 1]])
-            if reading is not None and reading.unit < MOST_UNITS:
-                times = min(reading.stamp // 1000, _LATEST), min(came, _LATEST)
-                row = _ROW.pack(*times, end, *reading.rate, *reading.acceleration)
-                found[Source(kind, reading.unit)] += row
+            if (number := message.get_msgId()) not in MESSAGES:
+                beside.append((came, message))
+                del beside[_MOST_BESIDE:]
+            elif understood(MESSAGES[number].kind, autopilot):
+                self._take_sample(found, message, data[at:end], came, end)
         raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))
         if raw in found and scaled not in found:
             found[scaled] = found.pop(raw)
@@ -124,23 +125,64 @@ class Tlog(LibraryLog):
         self.start_utc = _start_utc_by(
             [table["came"] - table["stamp"] for table in tables.values()]
         )
-        if self.start_utc is not None:
-            for came, text in texts:
-                self.add_text(came - self.start_utc, "STATUSTEXT", text)
+        for source, table in tables.items():
+            self.add_temperature(source.instance, table["stamp"], table["temperature"])
+        for came, message in beside:
+            self._take_beside(message, came, autopilot)
         return {
             source: {name: table[name] for name in _COLUMNS.names or ()}
             for source, table in tables.items()
         }
 
-    def _take_words(
-        self, number: int, message: Any, came: int, texts: list[tuple[int, str]]
+    def _take_sample(
+        self,
+        found: defaultdict[Source, bytearray],
+        message: Any,
+        record: bytes,
+        came: int,
+        end: int,
     ) -> None:
-        """Take a text, or the serial number of the board."""
-        if number == _STATUSTEXT:
-            texts.append((came, str(message.text)))
+        """Take a message of an IMU. ``came``: us since 1970. ``end``: of its record."""
+        number = message.get_msgId()
+        kind = MESSAGES[number].kind
+        self.counts[kind] += 1
+        payload = _TIME + (10 if record[_TIME] == 0xFD else 6)
+        reading = read(number, record[payload : payload + record[_TIME + 1]])
+        if reading is not None and reading.unit < MOST_UNITS:
+            times = min(reading.stamp // 1000, _LATEST), min(came, _LATEST)
+            values = *reading.rate, *reading.acceleration, _degrees(message)
+            found[Source(kind, reading.unit)] += _ROW.pack(*times, end, *values)
+
+    def _take_beside(self, message: Any, came: int, autopilot: int) -> None:
+        """Take a text, a mode, the throttle or an id. ``came``: us since 1970."""
+        number = message.get_msgId()
+        if number == _AUTOPILOT_VERSION:
+            serial = bytes(message.uid2).hex()
+            self.hardware_id = serial.strip("0") and serial
+        if self.start_utc is None:
             return
-        serial = bytes(message.uid2).hex()
-        self.hardware_id = serial.strip("0") and serial
+        stamp = came - self.start_utc
+        if number == _STATUSTEXT:
+            self.add_text(stamp, "STATUSTEXT", str(message.text))
+        elif number == _HEARTBEAT and message.autopilot == autopilot:
+            if autopilot == ARDUPILOT:
+                vehicle = VEHICLES.get(message.type, "")
+                self.add_mode(stamp, ardupilot_mode(vehicle, message.custom_mode))
+            else:
+                self.add_mode(stamp, px4_heartbeat_mode(message.custom_mode))
+        elif number == _VFR_HUD:
+            self.throttle.add(np.array([stamp]), np.array([message.throttle]))
+        elif number == _PARAM_VALUE:
+            found = _DEVICE.fullmatch(str(message.param_id))
+            if found and 0 < message.param_value < LARGEST_DEVICE:
+                self.devices[int(found[1] or 1) - 1] = int(message.param_value)
+
+    def origin(self, source: Source) -> str:
+        """Return the message of a source: SCALED_IMU2."""
+        own = numbers(source.kind)
+        if len(own) > source.instance:
+            return MESSAGES[own[source.instance]].name
+        return f"{source.kind} id {source.instance}"
 
     def _autopilot(self, data: bytes) -> tuple[int, int] | None:
         """Return system and MAV_AUTOPILOT of the autopilot to read, or None."""
@@ -201,6 +243,12 @@ class Tlog(LibraryLog):
                     yield at, end, parser.decode(bytearray(data[start:end]))
             at = end
         self._lost = lost + len(data) - at
+
+
+def _degrees(message: Any) -> float:
+    """Return the temperature of an IMU, degC. NaN: it has no thermometer."""
+    unit = 1.0 if message.get_msgId() in numbers("HIGHRES_IMU") else 0.01
+    return unit * message.temperature if message.temperature else math.nan
 
 
 def record_end(data: bytes, at: int) -> int:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_log import (
     FLU,
+    LARGEST_DEVICE,
     SETTINGS,
     ImuSamples,
     Source,
@@ -37,6 +38,7 @@ from fdi_ros.bag.flight_log import (
     possible_start,
 )
 from fdi_ros.bag.library_log import Columns, LibraryLog, message_count
+from fdi_ros.bag.modes import px4_navigation_mode
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system import require
@@ -71,6 +73,13 @@ _WRONG = (
 _LONGEST_ID = 64
 #: us over which PX4 takes the means of vehicle_imu_status
 _MEAN_TIME = 100_000
+_THROTTLE = (
+    ("vehicle_thrust_setpoint", "xyz[2]"),
+    ("actuator_controls_0", "control[3]"),
+)
+"""Topics and fields with the throttle, of newer and older versions."""
+_TEMPERATURES = (("gyro_device_id", "temperature_gyro"), ("device_id", "temperature"))
+"""Fields with the device of a gyro and its temperature."""
 _COUNTED = ("gyro_error_count", "gyro_clipping")
 _HELD = {
     "temperature_gyro": "{low:.1f} to {high:.1f} degC",
@@ -149,6 +158,7 @@ class Ulog(LibraryLog):
                 parts[Source(one.name, one.multi_id)].append(one.data)
             elif one.name in _GPS and self.start_utc is None:
                 self.start_utc = _start_utc(one.data)
+            self._take_flight(one.name, one.data)
         found = {
             source: columns
             for source, columns in {
@@ -169,7 +179,33 @@ class Ulog(LibraryLog):
         status = {one: found[one] for one in sorted(found) if one.kind == _STATUS}
         together = _simultaneous(status)
         self.status = _status_words(status, together)
+        self._take_temperatures(found)
         return found | together
+
+    def _take_flight(self, name: str, columns: Columns) -> None:
+        """Take modes and throttle."""
+        if name == "vehicle_status" and {"timestamp", "nav_state"} <= columns.keys():
+            for stamp, number in zip(
+                columns["timestamp"].tolist(),
+                columns["nav_state"].tolist(),
+                strict=True,
+            ):
+                self.add_mode(stamp, px4_navigation_mode(number))
+        for topic, field in _THROTTLE:
+            if name == topic and {"timestamp", field} <= columns.keys():
+                self.throttle.add(columns["timestamp"], np.abs(columns[field]))
+
+    def _take_temperatures(self, topics: Mapping[Source, Columns]) -> None:
+        """Take the temperature and the device of each IMU, matched by its device."""
+        for source, columns in topics.items():
+            for device_field, field in _TEMPERATURES:
+                if device_field in columns and message_count(columns):
+                    device = int(columns[device_field][0])
+                    if 0 < device < LARGEST_DEVICE:
+                        self.devices.setdefault(source.instance, device)
+                    if field in columns:
+                        stamp = columns["timestamp"]
+                        self.add_temperature(source.instance, stamp, columns[field])
 
     def samples(self, kind: str, columns: Columns) -> ImuSamples | None:
         """Return the samples in messages of a kind, None if a field is missing or malformed."""

@@ -84,6 +84,8 @@ class TopicReport:
     #: topic of the same sensor: the same values to rounding, turned, scaled or some
     #: messages apart
     copy_of: str = ""
+    #: message of the flight log and device, empty: no flight log
+    origin: str = ""
 
     def __post_init__(self) -> None:
         self.expect(0)
@@ -152,7 +154,11 @@ def inspect(
     with Recording(path) as recording:
         wanted = {name.lstrip("/") for name in topics}
         reports = [
-            TopicReport(topic, source_of_type(topic.type))
+            TopicReport(
+                topic,
+                source_of_type(topic.type),
+                origin=recording.context.origins.get(topic.name, ""),
+            )
             for topic in recording.topics
             if not wanted or topic.name.lstrip("/") in wanted
         ]
@@ -325,6 +331,11 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
             [report.topic.type for report in reports],
             ("type",),
             lambda kind: shown(kind or "unknown"),
+        ),
+        *(
+            [Column("origin", [one.origin or None for one in reports], ("in the log",))]
+            if any(one.origin for one in reports)
+            else []
         ),
         Column("messages", [report.received for report in reports], ("messages",)),
         Column("rate_hz", [report.rate for report in reports], ("rate",), ".1f"),

@@ -96,6 +96,10 @@ class UnitHealth:
     """Standard deviation of the delay, s."""
     copy_of: str = ""
     """Unit of which it repeats the values. Empty: none."""
+    origin: str = ""
+    """Message of the flight log, and the id of the device. Empty: no flight log."""
+    temperature_c: tuple[float, float] | None = None
+    """Lowest and highest temperature, degrees Celsius. None: not logged."""
 
 
 @dataclass(frozen=True)

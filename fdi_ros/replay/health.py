@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.raw import Batch
 from fdi_ros.model.quantity import RATE, Quantity
 from fdi_ros.model.samples import Array, Block, Int
@@ -150,6 +151,16 @@ def with_delivery(unit: UnitHealth, delivery: Delivery) -> UnitHealth:
         slow_to_s=delivery.slow_to,
         slow_rate_hz=delivery.slow_rate,
     )
+
+
+def with_context(unit: UnitHealth, context: FlightContext) -> UnitHealth:
+    """Return the health of a unit with its message and temperature in the log."""
+    course = context.temperatures.get(unit.topic)
+    temperature = None
+    if course is not None:
+        temperature = float(course.value.min()), float(course.value.max())
+    origin = context.origins.get(unit.topic, "")
+    return replace(unit, origin=origin, temperature_c=temperature)
 
 
 class Values:

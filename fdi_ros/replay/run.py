@@ -37,7 +37,7 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.soundness import RateHealth, UnitHealth
 from fdi_ros.monitor.status import ChannelStatus, Status
 from fdi_ros.replay.episodes import GAP, Story, pieces
-from fdi_ros.replay.health import Deliveries, Values, with_delivery
+from fdi_ros.replay.health import Deliveries, Values, with_context, with_delivery
 from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
 from fdi_ros.replay.summary import (
@@ -508,9 +508,10 @@ def replay(
         judge = _judged(samples, settings, _faults(faults), start, sinks, progress)
         stream = _stream_result(samples, settings, judge)
         texts = recording.texts
+        context = recording.context
     judgement = judge.judgement()
     units = [
-        with_delivery(unit, delivery)
+        with_context(with_delivery(unit, delivery), context)
         for unit, delivery in zip(
             judgement.monitor.units, deliveries.result(), strict=True
         )
@@ -524,6 +525,7 @@ def replay(
         stream=stream,
         seconds=clock() - begun,
         autopilot=tuple(_autopilot_texts(texts, judge)),
+        context=context,
     )
     return with_unused(summary, unused)
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.monitor.output import time_index
 from fdi_ros.monitor.soundness import (
     ChannelHealth,
@@ -228,6 +229,8 @@ class Summary(Judgement):
     """Messages of the autopilot from the first sample to the last."""
     verdict: ReplayVerdict = NO_VERDICT
     """The verdict."""
+    context: FlightContext = field(default_factory=FlightContext)
+    """Temperatures, throttle and flight modes of a flight log."""
 
     @property
     def concerns(self) -> list[Concern]:

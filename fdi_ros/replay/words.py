@@ -5,16 +5,14 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 from fdi_ros.faults.fault import ACCELEROMETERS
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import ODD
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
-from fdi_ros.monitor.soundness import Word, short_names
+from fdi_ros.monitor.soundness import UnitHealth, Word, short_names
 from fdi_ros.replay.episodes import (
     MOST_TOLD,
     Story,
@@ -45,7 +43,7 @@ from fdi_ros.report.layout import (
 from fdi_ros.system.text import listed, shown
 
 AUTOPILOT_LOGS = (".bin", ".tlog")
-"""Logs of ArduPilot: they count IMUs from 0, its messages and parameters from 1."""
+"""Suffixes of the logs of ArduPilot."""
 MOST_EPISODES = 20
 """Episodes that a terminal shows with all their details."""
 
@@ -75,15 +73,14 @@ def _concern_lines(summary: Summary) -> list[str]:
 
 
 def _name_lines(summary: Summary) -> list[str]:
-    """Return which topic, or which IMU of the autopilot, each unit is, unless its name is the topic."""
+    """Return which topic each unit is, or which message of the log, once."""
     units = summary.monitor.units
+    lines = []
     if any(one.topic.strip("/") != one.name.strip("/") for one in units):
-        return [f"Topics: {', '.join(f'{one.name} is {one.topic}' for one in units)}."]
-    numbers = [re.fullmatch(r"imu_(\d+)", one.name) for one in units]
-    if Path(summary.bag).suffix.lower() not in AUTOPILOT_LOGS or None in numbers:
-        return []
-    pairs = [f"{match[0]} is IMU {int(match[1]) + 1}" for match in numbers if match]
-    return [f"In STATUSTEXT and parameters of the autopilot, {listed(pairs)}."]
+        topics = ", ".join(f"{one.name} is {one.topic}" for one in units)
+        lines.append(f"Topics: {topics}.")
+    origins = [f"{one.name} is {one.origin}" for one in units if one.origin]
+    return [*lines, f"In the log, {'; '.join(origins)}."] if origins else lines
 
 
 def unchecked_words(channels: Sequence[ChannelResult]) -> str:
@@ -250,16 +247,27 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
         ),
         f"noise, {unit.name}": lambda row: number(_noise(row[1], unit), ".2g"),
         f"noise, {FORCES.name}": lambda row: number(_noise(row[1], FORCES), ".2g"),
+        "temperature": lambda row: _temperature_words(row[0]),
         "delay": lambda row: milliseconds(row[0].delay_s),
         "trouble": lambda row: _trouble_words(summary, row[0].name, row[1]),
     }
     if all(one.delay_s is None for one in units):
         del columns["delay"]
+    if all(one.temperature_c is None for one in units):
+        del columns["temperature"]
     if all(one.measured_in != FORCES.name for one in channels):
         del columns[f"noise, {FORCES.name}"]
     return Section(
         "Health of each unit", "", head_and_rows(columns, rows) if rows else ""
     )
+
+
+def _temperature_words(unit: UnitHealth) -> str:
+    """Return the range of the temperature of a unit. A dash: not logged."""
+    if unit.temperature_c is None:
+        return "-"
+    low, high = unit.temperature_c
+    return f"{low:.0f} to {high:.0f} °C"
 
 
 def _noise(channels: Sequence[ChannelResult], unit: Unit) -> float | None:

@@ -19,6 +19,7 @@ from bag.recordings import IMU, STORE, bounded
 from pymavlink.DFReader import DFReader_binary
 
 from fdi_ros.bag import dataflash, flight_log, ulog
+from fdi_ros.bag.flight_context import MOST_VALUES, Thinned
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.core.sources import ImuSource
@@ -39,6 +40,14 @@ KINDS = {
 EVERY = pytest.mark.parametrize(
     "kind", [kind for kind in KINDS if kind != "vehicle_imu_status"]
 )
+
+
+def topics_of(kind, count=3):
+    """Topics of a log: ArduPilot counts IMUs from 1, PX4 from 0."""
+    first = int(KINDS[kind][1] is write_dataflash)
+    return [f"/imu_{first + k}" for k in range(count)]
+
+
 EITHER = pytest.mark.parametrize("kind", ["IMU", "sensor_gyro"])
 
 
@@ -109,7 +118,8 @@ def test_rates_and_times_are_those_of_the_samples_in_front_left_up(
     monkeypatch.setitem(logs.ULOG_FORMATS, "sensor_gyro_fifo", fifo)
     made = units(seconds=8.0, start=start, apart=137)
     found, damage = messages(log(tmp_path, kind, made, gps=gps))
-    assert list(found) == ["/imu_0", "/imu_1", "/imu_2"]
+    topics = topics_of(kind)
+    assert list(found) == topics
     assert damage == ()
     for unit, (stamp, rate, _) in zip(made, found.values(), strict=True):
         step = 1000 if kind == "TimeMS" else 1
@@ -121,12 +131,12 @@ def test_rates_and_times_are_those_of_the_samples_in_front_left_up(
         }.get(kind, 0.0)
         np.testing.assert_allclose(rate, unit.rate * FLU, rtol=0.0, atol=error)
     # ROS reads the same, and of an autopilot no orientation.
-    message = STORE.deserialize_cdr(found["/imu_1"][2][7], IMU)
+    message = STORE.deserialize_cdr(found[topics[1]][2][7], IMU)
     assert (
         message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        == found["/imu_1"][0][7]
+        == found[topics[1]][0][7]
     )
-    assert message.header.frame_id == "imu_1"
+    assert message.header.frame_id == topics[1].strip("/")
     assert message.orientation_covariance[0] == -1.0
     has_acceleration = kind in ("IMU", "IMU2", "TimeMS", "IMT", "vehicle_imu")
     expected = made[1].acceleration[7] * FLU * has_acceleration
@@ -172,7 +182,7 @@ def as_pymavlink_reads(path):
     with contextlib.closing(DFReader_binary(str(path))) as opened:
         while (one := opened.recv_match(type=["IMU", "IMU2", "IMU3"])) is not None:
             instance = getattr(one, "I", ("IMU", "IMU2", "IMU3").index(one.get_type()))
-            rows.setdefault(f"/imu_{instance}", []).append(
+            rows.setdefault(f"/imu_{instance + 1}", []).append(
                 (one._timestamp, one.GyrX, -one.GyrY, -one.GyrZ)
             )
     return {name: np.array(values) for name, values in rows.items()}
@@ -184,7 +194,7 @@ def test_pymavlink_reads_the_same(tmp_path, kind):
     path = log(tmp_path, kind, units(seconds=1.0)) if kind in KINDS else real(kind)
     found, damage = messages(path)
     theirs = as_pymavlink_reads(path)
-    assert (list(found), damage) == (["/imu_0", "/imu_1", "/imu_2"], ())
+    assert (list(found), damage) == (topics_of("IMU"), ())
     for name, (stamp, rate, _) in found.items():
         assert (theirs[name][:, 1:] == rate).all()
         assert np.abs(theirs[name][:, 0] - stamp * 1e-9).max() < 2e-6
@@ -222,7 +232,7 @@ def test_units_and_multipliers_are_those_that_the_log_says(
     made = units(seconds=8.0)
     found, _ = messages(log(tmp_path, "IMU", made, extra=extra))
     np.testing.assert_allclose(
-        found["/imu_1"][1], made[1].rate * FLU * factor, rtol=1e-12
+        found["/imu_2"][1], made[1].rate * FLU * factor, rtol=1e-12
     )
 
 
@@ -238,7 +248,7 @@ def test_a_number_of_a_unit_or_an_error_that_is_none_is_no_defect(tmp_path, numb
         + logs.records(error, Subsys=number, ECode=1.0).tobytes()
     )
     found, damage = messages(log(tmp_path, "IMU", units(seconds=8.0), extra=extra))
-    assert (list(found), damage) == (["/imu_0", "/imu_1", "/imu_2"], ())
+    assert (list(found), damage) == (topics_of("IMU"), ())
 
 
 def test_what_was_appended_is_read_from_its_offset(tmp_path):
@@ -345,7 +355,7 @@ def test_damaged_times_are_left_out_and_a_gap_is_not(tmp_path, kind):
         stamp + 10**6 * np.array([-9 * (k == 100) for k in range(len(stamp))]),
         [0, 300, 301, 399],
     )
-    assert sorted(found["/imu_1"][0]) == sorted(UTC + (expected - FIX) * 1000)
+    assert sorted(found[topics_of(kind)[1]][0]) == sorted(UTC + (expected - FIX) * 1000)
     assert [line.partition(": ")[2] for line in damage] == [
         "samples with impossible times were left out"
     ]
@@ -358,7 +368,7 @@ def test_a_log_gives_the_verdicts_of_the_bag_made_of_it(tmp_path, kind, fdi):
         tmp_path / "made.yaml",
     )
     assert fdi("inspect", path, "--write", config, "--quiet").code == 0
-    assert Config.from_file(config).topics == ("/imu_0", "/imu_1", "/imu_2")
+    assert Config.from_file(config).topics == tuple(topics_of(kind))
     assert fdi("convert", path, "--output", tmp_path / "converted", "--quiet").code == 0
     found, words = (
         [],
@@ -375,6 +385,10 @@ def test_a_log_gives_the_verdicts_of_the_bag_made_of_it(tmp_path, kind, fdi):
         figures = json.loads(fdi("replay", one, *words, "--quiet").out)
         assert figures["faults"][0]["isolated"]
         assert figures["declared"] == []
+        for unit in figures["units"]:
+            # A bag has no word of the message in the log.
+            unit.pop("origin")
+            unit.pop("temperature_c")
         found.append(
             {
                 key: value
@@ -404,8 +418,9 @@ def test_a_unit_that_is_logged_slowly_or_hardly_is_left_out(
     made[1] = thinned(made[1], kept)
     path = log(tmp_path, kind, made)
     found, damage = messages(path)
-    assert list(found) == ["/imu_0", "/imu_2"]
-    assert damage == (f"{path.name}: {kind} 1 {words}, and was left out",)
+    assert list(found) == topics_of(kind)[::2]
+    origin = "IMU[1]" if kind == "IMU" else "sensor_gyro 1"
+    assert damage == (f"{path.name}: {origin} {words}, and was left out",)
 
 
 def test_a_sensor_logged_twice_is_read_once(tmp_path):
@@ -415,9 +430,9 @@ def test_a_sensor_logged_twice_is_read_once(tmp_path):
     path.write_bytes(raw + log(tmp_path, "IMU", units(3, seconds=8.0)).read_bytes())
     found, _ = messages(path)
     assert {name: len(one[0]) for name, one in found.items()} == {
-        "/imu_0": 1600,
         "/imu_1": 1600,
         "/imu_2": 1600,
+        "/imu_3": 1600,
     }
 
 
@@ -444,8 +459,8 @@ def test_a_sensor_logged_before_and_after_its_filters_is_read_once(
     at = data.index(struct.pack("<Q", made[0].stamp[200])) - 12
     path.write_bytes(data[:at] + data[at + size :])
     found, damage = messages(path)
-    assert list(found) == [f"/imu_{k}" for k in range(count)]
-    assert (found[f"/imu_{count - 1}"][1][-500:] == made[-1].rate[-500:] * FLU).all()
+    assert list(found) == topics_of("GYR", count)
+    assert (found[f"/imu_{count}"][1][-500:] == made[-1].rate[-500:] * FLU).all()
     words = [
         f"log.BIN: GYR {count + k} has the times of GYR {k}: taken for the same sensor"
         for k in range(count)
@@ -682,3 +697,50 @@ def test_a_default_log_shows_a_bias_and_no_more_than_that_is_said(tmp_path, fdi)
         assert replayed.code == 0, replayed
         assert "A COARSE CHECK" in replayed.out
     assert "A COARSE CHECK" in fdi("convert", path, "--output", tmp_path / "bag").out
+
+
+def test_the_flight_beside_the_rates_is_found_in_a_log(tmp_path):
+    """Modes have ArduPilot's names, throttle is a share, an IMU has its own device."""
+    mode = (91, "QMBB", "TimeUS,Mode,ModeNum,Rsn")
+    control = (92, "Qff", "TimeUS,ThI,ThO")
+    extra = b"".join(
+        format_record(number, name, form, columns)
+        for (number, form, columns), name in ((mode, "MODE"), (control, "CTUN"))
+    )
+    extra += logs.records(
+        logs.MESSAGES["MSG"], TimeUS=10**7, Message="ArduCopter V4.6.3"
+    ).tobytes()
+    for at, number in ((11, 5), (12, 5), (14, 9)):
+        extra += logs.records(mode, TimeUS=at * 10**6, ModeNum=number).tobytes()
+    extra += logs.records(
+        control, 3, TimeUS=np.array([10, 12, 14]) * 10**6, ThO=[0.0, 0.5, 0.7]
+    ).tobytes()
+    extra += logs.records(
+        logs.MESSAGES["PARM"], Name="INS_GYR2_ID", Value=2753036.0
+    ).tobytes()
+    with Recording(log(tmp_path, "IMU", units(seconds=8.0), extra=extra)) as opened:
+        context = opened.context
+    assert context.origins == {
+        "/imu_1": "IMU[0]",
+        "/imu_2": "IMU[1], device 2753036",
+        "/imu_3": "IMU[2]",
+    }
+    assert [one.name for one in context.modes] == ["LOITER", "LAND"]
+    first, second = (one.stamp - UTC for one in context.modes)
+    assert (first, second) == (6 * 10**9, 9 * 10**9)
+    assert context.throttle.value.tolist() == pytest.approx([0.0, 0.5, 0.7])
+    # The logs of the tests have zeros for temperatures: there is no thermometer.
+    assert context.temperatures == {}
+
+
+def test_a_course_keeps_its_extent_in_bounded_memory():
+    course = Thinned(0.0, 100.0)
+    stamp = np.arange(200_000) * 100_000
+    for part in np.split(stamp, 100):
+        course.add(part, np.full(len(part), 20.0))
+    course.add(stamp[-1:], np.array([np.nan]))
+    kept = course.course(shift=5)
+    assert MOST_VALUES // 2 - 1 <= len(kept.stamp) <= MOST_VALUES
+    assert kept.stamp[0] == 5000
+    assert kept.stamp[-1] > 0.99e3 * stamp[-1]
+    assert (np.diff(kept.stamp) > 0).all()

@@ -40,14 +40,14 @@ def test_values_and_times_are_those_that_pymavlink_reads(tmp_path, stack, versio
     )
     with Recording(path) as recording:
         assert [(topic.name, topic.count) for topic in recording.topics] == [
-            (f"/imu_{k}", 300) for k in range(3)
+            (f"/imu_{k}", 300) for k in (1, 2, 3)
         ]
         assert not recording.damage
     theirs, late = {"SCALED_IMU": [], "SCALED_IMU2": [], "SCALED_IMU3": []}, []
     with contextlib.closing(mavutil.mavlink_connection(str(path))) as log:
         while (message := log.recv_match(type=[*theirs])) is not None:
             theirs[message.get_type()].append(message)
-    for number, sent in enumerate(theirs.values()):
+    for number, sent in enumerate(theirs.values(), 1):
         found = messages(path, f"/imu_{number}")
         assert (
             np.diff(list(found))
@@ -72,7 +72,7 @@ def test_of_two_vehicles_the_first_is_read(tmp_path):
     )
     alone = Autopilot("px4", rates=SCALED, system=5)
     mixed, alone = (
-        messages(written(tmp_path / "a.tlog", telemetry(*some)), "/imu_1")
+        messages(written(tmp_path / "a.tlog", telemetry(*some)), "/imu_2")
         for some in ((one, other), (alone,))
     )
     assert list(mixed.values()) == list(alone.values())
@@ -83,7 +83,7 @@ def test_what_has_no_two_imus_is_refused(tmp_path):
     path = written(
         tmp_path / "a.tlog", telemetry(Autopilot(rates=dict.fromkeys(SCALED, 10.0)))
     )
-    assert len(messages(path, "/imu_2")) == 60
+    assert len(messages(path, "/imu_3")) == 60
     slow = telemetry(Autopilot(rates=dict.fromkeys(SCALED, 2.0)), seconds=20.0)
     one = Autopilot("ardupilot", rates={27: 50.0}, units=1)
     raw = telemetry(one)
@@ -108,7 +108,7 @@ def test_raw_imu_of_ardupilot_stands_in_for_imu_1(tmp_path):
         tmp_path / "a.tlog",
         telemetry(Autopilot("ardupilot", rates={27: 50.0, 116: 50.0}, units=2)),
     )
-    first, second = messages(path, "/imu_0"), messages(path, "/imu_1")
+    first, second = messages(path, "/imu_1"), messages(path, "/imu_2")
     assert len(first) == len(second) == 300
     assert np.abs(np.array(list(first.values())) - list(second.values())).max() < 0.02
 
@@ -128,11 +128,11 @@ LOG = telemetry(Autopilot("px4", rates=SCALED), seconds=3.0)
 def test_damage_is_read_around(tmp_path_factory, places, cut):
     """Whatever is overwritten or missing: what is read was in the log, and the rest is counted."""
     data, path = bytearray(LOG), tmp_path_factory.mktemp("tlog") / "damaged.tlog"
-    whole = set(messages(written(path, LOG), "/imu_0").values())
+    whole = set(messages(written(path, LOG), "/imu_1").values())
     for at, piece in places:
         data[at : at + len(piece)] = piece
     try:
-        found = messages(written(path, data[: len(LOG) - cut]), "/imu_0")
+        found = messages(written(path, data[: len(LOG) - cut]), "/imu_1")
     except BagError:
         return
     assert len(found) >= 150 - cut // 40 - 60

@@ -351,14 +351,14 @@ def test_the_questions_of_the_docs_are_answered(root, tmp_path, monkeypatch):
     )
     failing, drifting, noisy = (duckdb.sql(query).fetchall() for query in found)
     assert [(channel, flights) for _, channel, flights, _ in failing] == [
-        ("imu_2.x", 1)
+        ("imu_3.x", 1)
     ]
     assert failing[0][3] == pytest.approx(0.5, rel=0.1)
-    assert drifting[0][1] == "imu_1.y"
+    assert drifting[0][1] == "imu_2.y"
     # The axes of dataflash are turned into those of the body of ROS.
     assert drifting[0][2:] == pytest.approx((-0.01 * 30 / 28, 1.0), rel=0.05)
     assert [(Path(path).name, channel) for path, channel, _ in noisy] == [
-        ("4.bin", "imu_0.z")
+        ("4.bin", "imu_1.z")
     ]
 
 

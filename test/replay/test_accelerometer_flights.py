@@ -43,7 +43,7 @@ def test_every_fault_of_the_simulated_flight_is_named_or_held_in_a_set_and_none_
     """Its units are at one place, whether that is known or not."""
     rows = np.genfromtxt(SITL / "accel_faults.txt", dtype=str)
     faults = [
-        (float(on) - BEGINS, float(off) - BEGINS, f"imu_{int(unit) - 1}.accel_{axis}")
+        (float(on) - BEGINS, float(off) - BEGINS, f"imu_{int(unit)}.accel_{axis}")
         for on, off, unit, axis, kind, _ in rows
         if kind != "noise_times"
         for axis in axis.lower()
@@ -59,10 +59,10 @@ def test_every_fault_of_the_simulated_flight_is_named_or_held_in_a_set_and_none_
         assert one.state != "FAULTY" or set(one.channels) <= active
     assert len({one.channels for one in named}) >= least
     # A scale factor that is off by 5 % is 0.5 m/s^2 under gravity.
-    assert {"imu_2.accel_z"} in [set(one.channels) for one in named]
+    assert {"imu_3.accel_z"} in [set(one.channels) for one in named]
     # Noise five times as large declares nothing, and is told of.
     for axis in "xyz":
-        words = f"imu_0.accel_{axis}: for "
+        words = f"imu_1.accel_{axis}: for "
         assert [one for one in summary.monitor.degraded if one.startswith(words)]
     assert {on for on, _, _ in faults} == {
         max(on for on, _, _ in faults if on <= one.start_s)

@@ -162,15 +162,15 @@ def test_two_armings_are_judged_and_counted_each_for_itself(armings):
     )
     assert [round(one["start_s"]) for one in as_json(summary)["stretches"]] == [0, 100]
     # What stood at the end of the first is no evidence in the second.
-    early = parse_fault("channel=imu_0.x kind=bias size=0.1 start=20 stop=50")
+    early = parse_fault("channel=imu_1.x kind=bias size=0.1 start=20 stop=50")
     first, second = replay(*armings, (early,)).story.episodes
     assert (first.stretch, first.channels, first.injected) == (
         1,
-        ("imu_0.x",),
-        ("bias on imu_0.x",),
+        ("imu_1.x",),
+        ("bias on imu_1.x",),
     )
     assert (second.stretch, second.channels, second.injected) == (2, ("imu_2.y",), ())
-    late = parse_fault("channel=imu_0.x kind=bias size=0.1 start=60")
+    late = parse_fault("channel=imu_1.x kind=bias size=0.1 start=60")
     with pytest.raises(
         FaultError, match=r"starts at 60 s, expected at most 29\.99 s or at least"
     ):
@@ -178,7 +178,8 @@ def test_two_armings_are_judged_and_counted_each_for_itself(armings):
 
 
 def test_a_sweep_tries_no_fault_in_a_gap(tmp_path, armings):
-    config = armings[1]
+    topics = ["/imu_1", "/imu_2", "/imu_3"]
+    config = armings[1].replaced({"imus.topics": topics})
     block = read_block(
         two_armings(tmp_path / "sound.bin", logs.write_dataflash, faulty=False), config
     )
