@@ -11,6 +11,7 @@ stations set the same parameters. Link, monitor, autopilot and companion fail an
 anew. After every step the truth is checked, not the policy's view of it.
 """
 
+import math
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -66,6 +67,7 @@ class Flight:
         self.told: list[tuple[bool | None, int]] = [(None, 0) for _ in every]
         self.newest = [0 for _ in every]
         self.delivers = [True for _ in every]
+        self.stuck = [False for _ in every]
         self.linked = self.monitored = True
         self.restore = self.hurry = False
         self.disarmed = self.landed = 0
@@ -122,6 +124,7 @@ class Flight:
         elif not self.named[k]:
             self.named[k] = self.draw(20.0)
         self.delivers[k] = not self.draw(0.1) and (self.delivers[k] or self.draw(20.0))
+        self.stuck[k] ^= self.draw(1.0 if self.stuck[k] else 0.1)
         if self.draw(0.05):
             self.set_use(k, bool(random.random() < 0.5), OTHERS)
         self.linked ^= self.draw(0.05 if self.linked else 1.0)
@@ -146,10 +149,15 @@ class Flight:
         """Return the policy's view."""
         imus = []
         for k in range(self.count):
-            others = [abs(self.error[k] - self.error[j]) for j in range(self.count)]
-            size = min(others[:k] + others[k + 1 :])
-            apart = size >= self.settings.min_size
-            self.agreed[k] = None if apart else (self.agreed[k] or self.now)
+            # One that is stuck is no measure for others.
+            others = [
+                abs(self.error[k] - self.error[j])
+                for j in range(self.count)
+                if j != k and not self.stuck[j]
+            ]
+            size = min(others, default=math.nan)
+            agrees = size < self.settings.min_size and not self.stuck[k]
+            self.agreed[k] = (self.agreed[k] or self.now) if agrees else None
             imus.append(
                 Imu(
                     use=self.told[k][0]
@@ -160,6 +168,7 @@ class Flight:
                     blamed=self.named[k],
                     ok=not self.named[k] and not self.error[k],
                     delivers=self.delivers[k],
+                    stuck=self.stuck[k],
                     size=size,
                     agreed=self.agreed[k],
                 )
@@ -207,8 +216,10 @@ class Flight:
             return
         assert self.armed
         assert self.monitored
-        others = [self.error[j] for j in range(self.count) if j != k]
-        if self.count == 3:
+        rest = [j for j in range(self.count) if j != k]
+        assert any(view.imus[j].use and not self.stuck[j] for j in rest)
+        others = [self.error[j] for j in rest if not self.stuck[j]]
+        if len(others) == 2:
             # Two gyros that fail alike cannot be told from two healthy ones.
             alike = abs(others[0] - others[1]) < self.settings.min_size
             assert self.error[k] >= self.settings.min_size or (alike and all(others))
@@ -243,6 +254,7 @@ class Flight:
         self.armed = self.restore = False
         for k in range(self.count):
             self.delivers[k] = True
+            self.stuck[k] = False
         end = self.now + GROUNDED + 30 * NS
         while self.now < end and any(one.ours for one in self.state.memories):
             self.step()
