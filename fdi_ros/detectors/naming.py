@@ -95,6 +95,7 @@ class Inference:
     before: Total  # sums of all samples before the mean
     y: Channels  # values less their estimated errors, rad/s
     covariance: Square  # M, (rad/s)^2
+    moved: Real  # by which each bias may have moved since the onset, rad/s
     rate: Vector  # mean body rate, rad/s
     angular_acceleration: (
         Channels  # recent peak of the angular acceleration along each channel, rad/s^2
@@ -206,7 +207,7 @@ def noise_of_mean(params: Constants, noise: Noise, i: int, size: int) -> float:
 def add_noise(
     params: Constants, kf: Estimator, inference: Inference, size: int
 ) -> None:
-    """Add noise to the covariance, and the errors that delays and nonlinear scale make in motion."""
+    """Add noise and moves of the biases, and what delays and nonlinearity make in motion."""
     # A delay leaves no trace in the mean of a turn that ends as it began.
     part = min(1.0, 3.0 * params.length / size)
     moves = 1.0 if kf.noise.regime == MOTION else 0.0
@@ -214,8 +215,9 @@ def add_noise(
         noise = noise_of_mean(params, kf.noise, i, size)
         speed = moves * (kf.total.speed[i] - inference.before.speed[i]) / size
         bent = params.nonlinearity[i] * speed
+        moved = inference.moved * inference.moved
         inference.covariance[i, i] += noise + kf.peak_extra[i] * part + bent * bent
-        inference.covariance[i, i] += kf.displaced[i] * part
+        inference.covariance[i, i] += kf.displaced[i] * part + moved
         place = params.layout.delays[params.unit[i]]
         if place >= 0:
             swing = moves * kf.peak_turn[i] * part
@@ -508,6 +510,12 @@ def moved_by(inference: Inference, n: int) -> float:
     residual = 2.0 * (inference.total - inference.fit_of_best)
     if inference.fitted or residual < UNEXPLAINED_SHARE * 2.0 * inference.total:
         return 0.0
+    return unexplained(inference, n)
+
+
+@compiled
+def unexplained(inference: Inference, n: int) -> float:
+    """Return the standard deviation of independent errors of all channels that explains the mean, rad/s."""
     trace = 0.0
     for i in range(n):
         if inference.mask >> i & 1:

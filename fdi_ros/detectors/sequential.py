@@ -431,6 +431,9 @@ class Sequential(Detector):
         Probability that the named set holds the truth, above 0.5 and below 1.
     bias_walk
         Random walk of the bias of each channel, scalar or (n,), rad/s/sqrt(s).
+    bias_move
+        By which a healthy bias may move within seconds, standard deviation, rad/s: a
+        fault has to be beyond that, unless it is sudden.
     delay_std
         Standard deviation of the delay of one unit against another, s.
     gain_is_fault
@@ -457,6 +460,7 @@ class Sequential(Detector):
         sample_rate: float | None = None,
         confidence: float = 0.999,
         bias_walk: float | Sequence[float] = 5e-5,
+        bias_move: float = 0.0,
         delay_std: float = 0.001,
         gain_is_fault: bool = False,
         louder: float = math.inf,
@@ -478,6 +482,7 @@ class Sequential(Detector):
                 "sample_rate": self.sample_rate,
                 "confidence": confidence,
                 "bias_walk": float(walk.max()),
+                "bias_move": bias_move,
                 "delay_std": delay_std,
                 "gain_is_fault": gain_is_fault,
                 "louder": louder,
@@ -517,7 +522,7 @@ class Sequential(Detector):
         )
         params["gain_is_fault"] = gain_is_fault
         params["louder"] = louder
-        params["rest_std"] = REST_STD
+        params["rest_std"], params["bias_move"] = REST_STD, bias_move
         used = all_sets(n)
         singular = np.linalg.svd(used[:, :, None] * geometry.axes, compute_uv=False)
         enough = used.sum(axis=1) >= MIN_CHANNELS

@@ -115,6 +115,7 @@ class Constants:
     # standard deviation of errors not linear in the rate, share of the rate along each
     nonlinearity: Channels
     rest_std: Real  # of the rate at rest, rad/s
+    bias_move: Real  # of a healthy bias in flight, standard deviation, rad/s
     determines: Sets  # sets of channels that give a rate
     spans: Sets  # of the sets that give a rate, those with redundancy
     least: Whole  # samples that a fault lasts

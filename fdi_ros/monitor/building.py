@@ -157,6 +157,7 @@ def _build(
     delay_std = UNIT_DELAY if source_of(config).stamped else CHANNEL_DELAY
     errors = {
         "bias_walk": config.noise.bias_walk,
+        "bias_move": quantity.bias_move * config.bias.turn_on_std,
         "delay_std": delay_std,
         "gain_is_fault": quantity.gain_is_fault,
         "louder": quantity.louder,

@@ -108,3 +108,20 @@ def test_a_quiet_gyro_is_not_stuck_because_another_one_fails(detector, kind):
         z[t > 12.0, 5] = z[t > 12.0, 5][0]
         limit = 14.0 if detector == "sequential" else 20.0
         assert 12.0 < first_named(judge(quiet, t, z), t, 5) < limit
+
+
+def test_biases_that_move_one_unit_after_another_are_no_fault(pipeline):
+    """By 6 mrad/s within 10 s, as in a thermal shock; 0.1 rad/s is named within 2 s all the same."""
+    for seed in range(3):
+        t, rate, noise = flight(seed, 100.0)
+        rng = np.random.default_rng(seed)
+        z = np.tile(rate, 3) + noise
+        for unit in range(3):
+            done = np.clip((t - 15.0 - 20.0 * unit) / 10.0, 0.0, 1.0)
+            size = rng.choice([-1, 1], 3) * rng.uniform(0.003, 0.006, 3)
+            z[:, 3 * unit : 3 * unit + 3] += np.outer(done, size)
+        assert not (judge(pipeline, t, z).state == ChannelState.FAULTY).any()
+        z[t > 80.0, 4] += 0.1
+        output = judge(pipeline, t, z)
+        assert 80.0 < first_named(output, t, 4) < 82.0
+        assert not (np.delete(output.state, 4, axis=1) == ChannelState.FAULTY).any()
