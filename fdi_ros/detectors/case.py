@@ -397,7 +397,7 @@ def gives_up(params: Constants, state: State, seconds: float) -> bool:
     )
     unsolved = case.isolated == 0 and not inference.fitted
     case.unsolved = max(case.unsolved + (seconds if unsolved else -seconds), 0.0)
-    if case.unsolved < UNSOLVED:
+    if params.bias_move == 0.0 or case.unsolved < UNSOLVED:
         return False
     std = unexplained(inference, params.sensors.n)
     move_biases(params, kf, std, 0.0)
