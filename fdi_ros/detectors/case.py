@@ -12,8 +12,13 @@ channels are excluded.
 from __future__ import annotations
 
 import math
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import (
+    MAX_CHANNELS,
     Channels,
     Flag,
     Mask,
@@ -39,7 +44,6 @@ from fdi_ros.detectors.sums import (
     Scales,
     forget_sums,
     look_back,
-    value_at,
 )
 from fdi_ros.estimator.error_states import ErrorStates, copy_states
 from fdi_ros.estimator.estimator import (
@@ -139,6 +143,9 @@ class State:
     stamp: Whole  # stamp of the last sample, ns
     estimator: Estimator
     scales: Scales
+    information: Annotated[  # of each kept block, s^2/rad^2
+        NDArray[np.float64], "f8", (KEPT, MAX_CHANNELS, MAX_CHANNELS)
+    ]
     case: Case
 
 
@@ -263,6 +270,15 @@ def open_case(params: Constants, state: State) -> None:
 
 
 @compiled
+def keep_information(params: Constants, state: State) -> None:
+    """Keep the information matrix of the last block beside its values."""
+    kept = state.information[state.scales[BLOCK].newest]
+    for i in range(params.sensors.n):
+        for j in range(params.sensors.n):
+            kept[i, j] = state.estimator.block_information[i, j]
+
+
+@compiled
 def shows_others(params: Constants, state: State, named: int) -> bool:
     """Whether single blocks since the onset show errors of channels other than the named ones.
 
@@ -270,8 +286,24 @@ def shows_others(params: Constants, state: State, named: int) -> bool:
     begin one after the other, may look like a fault of a third channel. The error of one
     channel has the same direction in every block, whatever its size there.
     """
+    scale = state.scales[BLOCK]
+    for back in range(scale.kept):
+        place = (scale.newest - back + KEPT) % KEPT
+        if scale.first[place] < state.case.onset - params.length:
+            break
+        if block_shows_others(params, state, named, place):
+            return True
+    return False
+
+
+@compiled
+def block_shows_others(params: Constants, state: State, named: int, place: int) -> bool:
+    """Whether one block shows errors of channels other than the named ones.
+
+    The correlations are those of the block itself: they change with the motion.
+    """
     kf, inference, n = state.estimator, state.case.inference, params.sensors.n
-    information, count = kf.block_information, 0
+    information, count = state.information[place], 0
     for i in range(n):
         if named >> i & 1:
             if count == 3 or not information[i, i] > 0.0:
@@ -290,34 +322,29 @@ def shows_others(params: Constants, state: State, named: int) -> bool:
                 share = dot(inference.inverse[p], inference.along, count)
                 inference.amplitude[p] = share
                 variance -= share * inference.along[p]
-            if variance > ALIKE and shows_other(params, state, named, j, variance):
+            if variance > ALIKE and shows_other(
+                params, state, named, j, place, variance
+            ):
                 return True
     return False
 
 
 @compiled
 def shows_other(
-    params: Constants, state: State, named: int, j: int, variance: float
+    params: Constants, state: State, named: int, j: int, place: int, variance: float
 ) -> bool:
     """Whether channel j shows more in a block than the named channels explain.
 
     ``amplitude`` holds the regression of channel j on each of the named channels.
     """
-    case, scale = state.case, state.scales[BLOCK]
-    for back in range(scale.kept):
-        first = scale.first[(scale.newest - back + KEPT) % KEPT]
-        if first < case.onset - params.length:
-            break
-        other, largest, p = value_at(scale, back, j), 0.0, 0
-        for i in range(params.sensors.n):
-            if named >> i & 1:
-                x = value_at(scale, back, i)
-                other -= case.inference.amplitude[p] * x
-                largest = max(largest, abs(x))
-                p += 1
-        if abs(other) > OTHERS * math.sqrt(variance) + TURNED * largest:
-            return True
-    return False
+    values, largest, p = state.scales[BLOCK].series[place], 0.0, 0
+    other = values[j]
+    for i in range(params.sensors.n):
+        if named >> i & 1:
+            other -= state.case.inference.amplitude[p] * values[i]
+            largest = max(largest, abs(values[i]))
+            p += 1
+    return abs(other) > OTHERS * math.sqrt(variance) + TURNED * largest
 
 
 @compiled

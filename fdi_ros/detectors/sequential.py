@@ -25,6 +25,7 @@ from fdi_ros.detectors.case import (
     follow_case,
     forget_evidence,
     goes_too_far,
+    keep_information,
     look_for_case,
     look_for_change_in_hole,
     look_for_drift,
@@ -188,6 +189,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     weight = judge_block(params, kf)
     if kf.judged:
         update_from_block(params, kf, state.scales, learns)
+        keep_information(params, state)
     update_rest(params, kf)
     if kf.rest and noise.regime == MOTION and learns:
         change_regime(noise, n, REST, False)

@@ -34,7 +34,6 @@ class Quantity(NamedTuple):
     as a fault of 0.3 m/s^2 would not be named."""
 
 
-
 RATE = Quantity("gyro", "rad/s", 1.0, False, math.inf, 0.06)
 #: 150 m/s^2 for 1 rad/s: then nothing is declared in thirty vibrating flights
 FORCE = Quantity("accelerometer", "m/s^2", 150.0, True, 16.0, 0.0)
