@@ -29,6 +29,7 @@ from fdi_ros.faults.kinds import (
     Memory,
     check_fields,
 )
+from fdi_ros.model.quantity import FORCE, RATE
 from fdi_ros.model.samples import Array, Block, Mask
 from fdi_ros.system.text import did_you_mean
 from fdi_ros.system.yaml_file import read_yaml
@@ -160,7 +161,14 @@ def fault_from(items: Mapping[str, Any]) -> Fault:
     when = {name: items[name] for name in _KEYS[2:] if name in items}
     # A key of a YAML file may be anything.
     options = {str(name): value for name, value in items.items() if name not in _KEYS}
-    return Fault(items["channel"], create_kind(items["kind"], **options), **when)
+    try:
+        kind = create_kind(items["kind"], **options)
+    except FaultError as error:
+        if ACCELEROMETERS not in items["channel"]:
+            raise
+        # Sizes have the same bounds in the unit of accelerometers.
+        raise FaultError(str(error).replace(RATE.unit, FORCE.unit)) from error
+    return Fault(items["channel"], kind, **when)
 
 
 def parse_fault(text: str) -> Fault:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdi_ros.bag.flight_context import Course
 from fdi_ros.bag.samples import Samples
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.geometry import Geometry
@@ -337,7 +338,12 @@ class Report(Sink):
         }
         names = [one.name for one in summary.monitor.channels]
         states = _timeline(names, self._first_states, summary, quiet)
-        spoken = {**common, "marks": [*common["marks"], *said]}
+        spoken = {
+            **common,
+            "shapes": [*_mode_shapes(summary), *shapes],
+            "marks": [*common["marks"], *said],
+            "backdrop": _throttle(summary),
+        }
         statistics = [curves.statistic(spoken) for curves in self._curves]
         stretches = stretch_words(story)
         sections = [
@@ -348,6 +354,7 @@ class Report(Sink):
                 [states, *statistics],
             ),
             _episode_section(story, bool(scores.faults), unit, self._origin),
+            *_temperature_section(summary, spoken),
             *(
                 [Section("Stretches", "Each is judged for itself.", stretches)]
                 if stretches
@@ -380,7 +387,7 @@ class Report(Sink):
     def _zoom_hint(self) -> str:
         words = (
             "Drag across a plot to zoom all plots in time, double-click to see "
-            "everything; arrow keys move the cursor."
+            "everything; arrow keys move the cursor. PNG and CSV at the corner of a plot save it."
         )
         if self._store.width == 1:
             return words
@@ -388,6 +395,61 @@ class Report(Sink):
             f"{words} A long recording: of every {self._store.width} samples the smallest and the largest value are"
             " drawn; close up, the lines between them are no course of time."
         )
+
+
+def _temperature_section(summary: Summary, layout: Mapping[str, Any]) -> list[Section]:
+    """Draw the temperature of each IMU. Empty: the log has none."""
+    lines = []
+    for i, one in enumerate(summary.monitor.units):
+        course = summary.context.temperatures.get(one.topic)
+        if course is not None:
+            x, y = _within(summary, course)
+            look = {"color": colour_of(i)}
+            line = {"type": "scatter", "name": one.name, "line": look}
+            lines.append({**line, "x": x, "y": y})
+    if not lines:
+        return []
+    figure = _plot(lines, 210, "temperature, °C", True, layout)
+    hint = "A gyro that warms up changes its bias."
+    return [Section("Temperature of each IMU", hint, "", [figure])]
+
+
+def _within(summary: Summary, course: Course) -> tuple[list[float], list[float]]:
+    """Return times, s, and values of a course from the first sample to the last."""
+    time = (course.stamp - (summary.stream.origin_ns or 0)) * 1e-9
+    inside = (time >= summary.scores.start_s) & (time <= summary.scores.end_s)
+    return (
+        np.round(time[inside], 3).tolist(),
+        np.round(course.value[inside], 3).tolist(),
+    )
+
+
+def _throttle(summary: Summary) -> dict[str, list[float]] | None:
+    """Return the throttle for the background of a plot. None: not logged."""
+    course = summary.context.throttle
+    if course is None:
+        return None
+    x, y = _within(summary, course)
+    return {"x": x, "y": y}
+
+
+def _mode_shapes(summary: Summary) -> list[dict[str, Any]]:
+    """Return the flight modes as labelled shades."""
+    origin, scores = summary.stream.origin_ns or 0, summary.scores
+    modes = summary.context.modes
+    begins = [(one.stamp - origin) * 1e-9 for one in modes]
+    ends = [*begins, scores.end_s][1:]
+    return [
+        {
+            "type": "rect",
+            "kind": f"mode {'even' if k % 2 else 'odd'}",
+            "x0": max(begin, scores.start_s),
+            "x1": min(end, scores.end_s),
+            "label": one.name,
+        }
+        for k, (one, begin, end) in enumerate(zip(modes, begins, ends, strict=True))
+        if end > scores.start_s and begin < scores.end_s
+    ]
 
 
 def _channel_section(summary: Summary, unit: Unit) -> Section:
@@ -679,6 +741,10 @@ def _marks_hint(summary: Summary) -> str:
     if summary.scores.faults:
         hint = "Shaded: injected faults; ▼ detected, ◆ isolated, ✕ declared without an injected fault that explains it."
     hint += " □ the autopilot said something." if summary.autopilot else ""
+    if summary.context.modes:
+        hint += " Background: flight modes, named at the bottom."
+    if summary.context.throttle is not None:
+        hint += " Blue area: throttle, from zero to full."
     return hint + (
         " Grey: gaps; each stretch between them is judged for itself."
         if summary.story.gaps

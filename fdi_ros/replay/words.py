@@ -15,6 +15,7 @@ from fdi_ros.monitor.receiver import RATE_TOLERANCE
 from fdi_ros.monitor.soundness import UnitHealth, Word, short_names
 from fdi_ros.replay.episodes import (
     MOST_TOLD,
+    Episode,
     Story,
     detail_words,
     episode_words,
@@ -40,10 +41,12 @@ from fdi_ros.report.layout import (
     number,
     section_text,
 )
-from fdi_ros.system.text import listed, shown
+from fdi_ros.system.text import first_of, listed, shown
 
 AUTOPILOT_LOGS = (".bin", ".tlog")
 """Suffixes of the logs of ArduPilot."""
+FOLDED = 4
+"""Episodes without data for one reason from which on a terminal shows them as one."""
 MOST_EPISODES = 20
 """Episodes that a terminal shows with all their details."""
 
@@ -362,7 +365,9 @@ def size_of(fault: Outcome, unit: Unit = RADIANS) -> str:
 
 def _episodes(story: Story, scored: bool, unit: Unit) -> str:
     """List the episodes: channels, time and size, then the details."""
-    first = story.episodes[:MOST_EPISODES]
+    silent, folded = _folded(story)
+    shown_ones = [one for one in story.episodes if one not in silent]
+    first = shown_ones[:MOST_EPISODES]
     lines = ["\nwhat happened\n"] if first else []
     for place, one in enumerate(first, 1):
         where = f" (stretch {one.stretch})" if len(story.stretches) > 1 else ""
@@ -371,5 +376,26 @@ def _episodes(story: Story, scored: bool, unit: Unit) -> str:
             f"       {title}: {words}\n"
             for title, words in detail_words(one, unit, scored)
         ]
-    more = len(story.episodes) - len(first) + story.more
+    lines += [f"  {len(first) + k}. {words}\n" for k, words in enumerate(folded, 1)]
+    if folded and not first:
+        lines.insert(0, "\nwhat happened\n")
+    more = len(shown_ones) - len(first) + story.more
     return "".join([*lines, f"  and {more} more\n"] if more else lines)
+
+
+def _folded(story: Story) -> tuple[list[Episode], list[str]]:
+    """Return the episodes without data that are alike, and a sentence for each kind."""
+    alike: dict[str, list[Episode]] = {}
+    for one in story.episodes:
+        if not one.declares and not one.injected:
+            alike.setdefault(one.evidence.reason, []).append(one)
+    alike = {why: some for why, some in alike.items() if len(some) >= FOLDED}
+    words = []
+    for why, some in alike.items():
+        channels = sorted({name for one in some for name in one.channels})
+        who = first_of(short_names(channels), MOST_TOLD)
+        begin, end = some[0].start_s, max(one.end_s for one in some)
+        words.append(
+            f"{len(some)} times between {begin:.1f} and {end:.1f} s STALE: {who} ({why})"
+        )
+    return [one for some in alike.values() for one in some], words

@@ -210,6 +210,7 @@ _SCRIPTS = (
     "plot_scale.js",
     "plot_chart.js",
     "plot_other.js",
+    "plot_save.js",
     "table.js",
     "page.js",
 )

@@ -29,6 +29,7 @@ class Chart {
     this.stage.setAttribute("aria-label", this.words());
     this.listen();
     link.charts.push(this);
+    addSaving(this);
   }
 
   get shown() { return this.traces.filter((trace) => !this.section.hidden.has(trace.key)); }
@@ -91,7 +92,7 @@ class Chart {
     const parts = [
       `<svg width="${width}" height="${height}" viewBox="0 0 ${width} ${height}" aria-hidden="true">`,
       `<clipPath id="${clip}"><rect x="${left}" y="${top}" width="${px(right - left)}" height="${px(base - top)}"/></clipPath>`,
-      this.grid(left, right, top, base), `<g clip-path="url(#${clip})">`, this.shapes(top, base),
+      this.grid(left, right, top, base), `<g clip-path="url(#${clip})">`, this.shapes(top, base), this.backdrop(top, base),
       ...this.shown.map((trace) => this.trace(trace)), "</g>", this.marks(top, base), this.labels(top), this.head(left, right),
       '<line class="cursor" y1="22" y2="' + base + '" hidden/></svg>',
     ];
@@ -136,10 +137,23 @@ class Chart {
   }
 
   shapes(top, base) {
+    const [left, right] = this.x.pixels;
     return (this.layout.shapes ?? []).map((shape) => {
       const from = this.x.to(shape.x0), to = this.x.to(shape.x1 ?? this.x.range[1]);
-      return `<rect class="${shape.kind}" x="${px(from)}" y="${top}" width="${px(Math.max(to - from, 0.5))}" height="${px(base - top)}"/>`;
+      const begin = Math.max(from, left) + 3, label = shape.label ?? "";
+      const words = label && Math.min(to, right) - begin > label.length * LETTER
+        ? `<text class="tick" x="${px(begin)}" y="${px(base - 5)}">${esc(label)}</text>` : "";
+      return `<rect class="${shape.kind}" x="${px(from)}" y="${top}" width="${px(Math.max(to - from, 0.5))}" height="${px(base - top)}"/>${words}`;
     }).join("");
+  }
+
+  backdrop(top, base) { // a share from 0 to 1 over the height of the plot
+    const { x, y } = this.layout.backdrop ?? { x: [], y: [] };
+    if (x.length < 2) return "";
+    const path = points({ x, low: y, high: y }, this.link.range, this.x.pixels[1] - this.x.pixels[0])
+      .filter(([, share]) => Number.isFinite(share)).map(([at, share]) => `${px(this.x.to(at))},${px(base - share * (base - top))}`);
+    if (!path.length) return "";
+    return `<path class="backdrop" d="M${path[0].split(",")[0]},${base}L${path.join("L")}L${path[path.length - 1].split(",")[0]},${base}Z"/>`;
   }
 
   trace(trace) {

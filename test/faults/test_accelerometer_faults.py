@@ -3,10 +3,13 @@
 
 """Every kind of fault in an accelerometer changes that channel alone, while the fault lasts."""
 
+import re
+
 import numpy as np
 import pytest
 from monitor.test_accelerometers import flight, settings
 
+from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.accelerometers import accelerometer_names
@@ -56,3 +59,19 @@ def test_a_fault_strikes_its_accelerometer_alone(kind):
     inside = (block.stamp - block.stamp[0]) * 1e-9
     rows = (inside >= 4.0) & (inside < 8.0)
     np.testing.assert_array_equal(before[~rows], after[~rows])
+
+
+@pytest.mark.parametrize(
+    ("channel", "words"),
+    [
+        ("imu_1.accel_x", "in m/s^2"),
+        ("imu_1.accel", "in m/s^2"),
+        ("imu_1.x", "in rad/s"),
+    ],
+)
+def test_a_missing_size_is_asked_for_in_the_unit_of_the_channel(channel, words):
+    with pytest.raises(FaultError, match=re.escape(f"needs size {words}") + "$"):
+        parse_fault(f"channel={channel} kind=bias")
+    unit = words.removeprefix("in ")
+    with pytest.raises(FaultError, match=re.escape(unit)):
+        parse_fault(f"channel={channel} kind=bias size=1e9")

@@ -469,3 +469,46 @@ def test_a_click_on_a_head_sorts_figures_by_size_and_names_as_a_reader_would(
         back = [cell for cell in reversed(cells) if cell not in ("-", "")]
         assert driver.execute_script(shown)[: len(back)] == back, name
     assert complaints(driver) == []
+
+
+SAVED = """
+const done = arguments[0];
+const charts = sections.flatMap((s) => s.plots).filter((p) => p instanceof Chart);
+const save = async () => {
+  const picture = await pictureOf(charts[1]);
+  return [picture.width / charts[1].width, picture.toDataURL("image/png").length, charts.map(csvOf)];
+};
+save().then(done, (error) => done(String(error)));
+"""
+
+
+def test_a_plot_is_saved_as_a_picture_and_as_a_table_of_what_is_shown(browser):
+    browser.execute_script("links.time.zoom([19, 21])")
+    scale, length, tables = browser.execute_async_script(SAVED)
+    browser.execute_script("links.time.zoom(null)")
+    assert (scale, length > 5_000) == (2, True)
+    states, statistic = (text.split("\n") for text in tables[:2])
+    assert states[0] == "from,to,name,state"
+    assert any(line.endswith(",g2,FAULTY") for line in states)
+    rows = [line.split(",") for line in statistic[1:]]
+    assert {name for name, *_ in rows} == {"statistic", "threshold"}
+    times = [float(time) for _, time, *_ in rows]
+    assert 19 <= min(times) < 19.1
+    assert 20.9 < max(times) <= 21
+    assert complaints(browser) == []
+
+
+def test_a_page_draws_temperatures_and_modes_of_a_log(folder):
+    path = folder / "crash.html"
+    words = ["replay", str(ROOT / "bags" / "copter_crash.tlog"), "--report", str(path)]
+    assert command_line.main(words) == 3
+    text = path.read_text()
+    assert "Temperature of each IMU" in text
+    assert '"label":"GUIDED"' in text
+    data = json.loads(
+        re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.DOTALL)[1]
+    )
+    titles = [one["layout"].get("yaxis", {}).get("title") for one in data["figures"]]
+    drawn = data["figures"][titles.index({"text": "temperature, °C"})]["data"]
+    assert [one["name"] for one in drawn] == ["imu_1", "imu_2", "imu_3"]
+    assert 37.8 < min(drawn[0]["y"]) < max(drawn[0]["y"]) < 38.4
