@@ -83,8 +83,8 @@ def test_vibration_that_one_accelerometer_rectifies_at_take_off_declares_nothing
 @pytest.mark.parametrize(
     ("log", "channel", "start"),
     [
-        ("quad_20mm_cut_straight", "imu_2.accel_y", 52),
-        ("quad_5mm_cut_hover", "imu_0.accel_y", 37),
+        ("quad_20mm_cut_straight", "imu_3.accel_y", 52),
+        ("quad_5mm_cut_hover", "imu_1.accel_y", 37),
     ],
 )
 def test_a_bias_is_named_in_hover_that_shakes_units_whose_positions_are_not_known(
