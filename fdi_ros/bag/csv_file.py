@@ -244,6 +244,27 @@ def find_columns(
     return delimiter, _columns(file, names, note, first)
 
 
+class _Choice(NamedTuple):
+    """Columns of a table by name, before their units."""
+
+    #: entries of ``columns.yaml``, empty without the file
+    given: dict[str, Any]
+    time: str
+    #: rates about x, y and z of each IMU
+    imus: list[list[str]]
+    #: accelerations along x, y and z of each IMU, empty without any
+    forces: list[list[str]]
+
+    def factors(
+        self, entry: str, triads: list[list[str]], units: dict[str, float]
+    ) -> list[float]:
+        """Return the factor of each IMU: by an entry of ``columns.yaml``, else by its first name."""
+        return [
+            _factor(str(self.given.get(entry, _split(x)[1])), units, 1.0, x)
+            for x, _, _ in triads
+        ]
+
+
 def _columns(
     file: BinaryIO, names: Sequence[str], note: Callable[[str], None], first: int
 ) -> Columns:
@@ -251,12 +272,32 @@ def _columns(
 
     `BagError` if no gyro is found, or ``columns.yaml`` names other columns.
     """
+    choice = _chosen_names(file, names, note)
+    time_unit = str(choice.given.get("time_unit", _split(choice.time)[1]))
+    columns = Columns(
+        names.index(choice.time),
+        _factor(time_unit, _TIME_UNITS, 0.0, choice.time),
+        _places(names, choice.imus),
+        tuple(choice.factors("rate_unit", choice.imus, _RATE_UNITS)),
+        _places(names, choice.forces),
+        tuple(choice.factors("acceleration_unit", choice.forces, _FORCE_UNITS)),
+    )
+    _note_choice(choice, columns, note, first)
+    return columns
+
+
+def _chosen_names(
+    file: BinaryIO, names: Sequence[str], note: Callable[[str], None]
+) -> _Choice:
+    """Choose columns by ``columns.yaml`` in the folder of a table, else by their names."""
     path = Path(file.name).parent / COLUMNS
-    told = read_yaml(path, "file", BagError) if path.exists() else {}
-    if not isinstance(told, dict) or set(told) - _ENTRIES:
+    given = read_yaml(path, "file", BagError) if path.exists() else {}
+    if not isinstance(given, dict) or set(given) - _ENTRIES:
         raise BagError(f"{path}: expected {', '.join(sorted(_ENTRIES))}")
-    imus = told["imus"] if "imus" in told else _imus(names, note)
-    forces = told["accelerations"] if "accelerations" in told else _forces(names, imus)
+    imus = given["imus"] if "imus" in given else _imus(names, note)
+    forces = (
+        given["accelerations"] if "accelerations" in given else _forces(names, imus)
+    )
     for entry, triads in (("imus", imus), ("accelerations", forces)):
         if not isinstance(triads, list) or any(
             not isinstance(triad, list) or len(triad) != 3 for triad in triads
@@ -266,9 +307,8 @@ def _columns(
         raise BagError(
             f"{path}: accelerations names {len(forces)} IMUs, imus names {len(imus)}"
         )
-    time: Any = told.get(
-        "time", next((name for name in names if _TIME.fullmatch(_split(name)[0])), None)
-    )
+    by_name = (name for name in names if _TIME.fullmatch(_split(name)[0]))
+    time: Any = given.get("time", next(by_name, None))
     listed = shown(", ".join(names), MOST_SHOWN)
     for name in (time, *(column for triad in (*imus, *forces) for column in triad)):
         if name not in names:
@@ -280,39 +320,36 @@ def _columns(
         raise BagError(
             f"{file.name} has no columns of gyros among {listed}; {COLUMNS} says which: {GUIDE}"
         )
-    tick = _factor(str(told.get("time_unit", _split(time)[1])), _TIME_UNITS, 0.0, time)
-    rates = [
-        _factor(str(told.get("rate_unit", _split(x)[1])), _RATE_UNITS, 1.0, x)
-        for x, _, _ in imus
-    ]
-    force_factors = [
-        _factor(str(told.get("acceleration_unit", _split(x)[1])), _FORCE_UNITS, 1.0, x)
-        for x, _, _ in forces
-    ]
-    said = "; ".join(
-        f"/imu_{k} = {', '.join(imu)}" for k, imu in enumerate(imus, first)
+    return _Choice(given, time, imus, forces)
+
+
+def _places(
+    names: Sequence[str], triads: list[list[str]]
+) -> tuple[tuple[int, int, int], ...]:
+    """Return the indices of the columns of each IMU."""
+    return tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in triads)
+
+
+def _note_choice(
+    choice: _Choice, columns: Columns, note: Callable[[str], None], first: int
+) -> None:
+    """Note which columns are read, and in which units."""
+    source = COLUMNS if "imus" in choice.given else "their names"
+    imus = "; ".join(
+        f"/imu_{k} = {', '.join(imu)}" for k, imu in enumerate(choice.imus, first)
     )
-    stated = "rate_unit" in told or all(_split(x)[1] for x, _, _ in imus)
-    unit = (
-        " in deg/s"
-        if _DEGREES in rates
-        else ""
-        if stated
-        else "; no unit in the names: rad/s assumed"
-    )
-    note(
-        f"columns, by {'their names' if 'imus' not in told else COLUMNS}: time = {time}; {said}{unit}"
-    )
-    if forces:
-        listed = "; ".join(", ".join(force) for force in forces)
-        in_unit = "" if set(force_factors) == {1.0} else ", converted to m/s^2"
+    unit = ""
+    if _DEGREES in columns.factors:
+        unit = " in deg/s"
+    elif "rate_unit" not in choice.given and not all(
+        _split(x)[1] for x, _, _ in choice.imus
+    ):
+        unit = "; no unit in the names: rad/s assumed"
+    note(f"columns, by {source}: time = {choice.time}; {imus}{unit}")
+    if choice.forces:
+        listed = "; ".join(", ".join(force) for force in choice.forces)
+        in_unit = "" if set(columns.force_factors) == {1.0} else ", converted to m/s^2"
         note(f"accelerations in the order of the IMUs: {listed}{in_unit}")
-    places, beside = (
-        tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in triads)
-        for triads in (imus, forces)
-    )
-    factors = tuple(force_factors)
-    return Columns(names.index(time), tick, places, tuple(rates), beside, factors)
 
 
 def has_gyros(file: BinaryIO) -> bool:

@@ -244,7 +244,7 @@ class FlightLog(BagFile):
             while not self._survey():
                 pass
             self._sources = self._choose()
-        except BaseException:
+        except BaseException:  # Close the file whatever ends the opening.
             self.close()
             raise
         dated = EARLIEST // 1000 <= self._starts[0] < NO_HORIZON

@@ -99,7 +99,7 @@ class Recording:
         try:
             self._left = max_unpacked_bytes(sum(path.stat().st_size for path in paths))
             self._open_all(paths)
-        except BaseException:
+        except BaseException:  # Close the files whatever ends the opening.
             self.close()
             raise
         self._files.sort(key=lambda file: file.start_time)

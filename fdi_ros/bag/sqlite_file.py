@@ -58,7 +58,7 @@ class SqliteFile(LibraryBag):
             self._check_tables()
             self._numbered = self._topics()
             start = next(self._query("SELECT MIN(timestamp) FROM messages"))[0]
-        except BaseException as error:
+        except BaseException as error:  # Close the file whatever ends the opening.
             self.close()
             if isinstance(error, (sqlite3.Error, OSError)):
                 raise BagError(f"{path} {self.refusal}: {error}") from error

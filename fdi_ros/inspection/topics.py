@@ -18,7 +18,8 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.core.copies import copies_among
 from fdi_ros.core.sources import Source, source_of_type
 from fdi_ros.inspection.repeats import Repeats
-from fdi_ros.inspection.segments import NoiseSegments
+from fdi_ros.inspection.segments import Noise, NoiseSegments
+from fdi_ros.model.quantity import FORCE
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.report.layout import (
     RADIANS,
@@ -102,6 +103,8 @@ class TopicReport:
         self.recent = np.zeros(
             (0, channels)
         )  # (K, c) values of the last messages, at most `RECENT`
+        # Specific forces over the natural size of `FORCE`: then the same test finds rest.
+        self.forces = NoiseSegments(channels)
 
     @property
     def rate(self) -> float:
@@ -137,6 +140,14 @@ class TopicReport:
         return self.channels > 0 and (
             self.complete or bool((self.not_finite + self.beyond).any())
         )
+
+    @property
+    def force_noise(self) -> Noise | None:
+        """Noise of the accelerometers, m/s^2. None if no message has a specific force."""
+        if self.forces.empty:
+            return None
+        quiet, moving, rest = self.forces.noise()
+        return Noise(FORCE.natural * quiet, FORCE.natural * moving, rest)
 
     @property
     def complete(self) -> bool:
@@ -191,11 +202,14 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
         if report.announced not in kind.value_counts:
             return
         report.expect(report.announced)
-    decoded = kind.decode(*messages, report.channels)
+    # A unit's messages may also have a specific force, behind the rate.
+    width = 2 * report.channels if kind.stamped else report.channels
+    decoded = kind.decode(*messages, width)
     good = decoded.good
     report.malformed += int((~good).sum())
     stamp = decoded.stamp[good]
-    values = decoded.values[good]
+    values = decoded.values[good, : report.channels]
+    force = decoded.values[good, report.channels :]
     times = times[good]
     if kind.stamped:
         _take_stamps(report, stamp)
@@ -212,6 +226,9 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     report.recent = np.vstack([report.recent, values])[-RECENT:]
     whole = believed.all(axis=1)
     report.segments.add(values[whole], times[whole], report.rate)
+    if kind.stamped:
+        felt = np.isfinite(force).all(axis=1)
+        report.forces.add(force[felt] / FORCE.natural, times[felt], report.rate)
 
 
 def usual_interval(steps: Array) -> float:
@@ -312,6 +329,7 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
     gyros = [
         report.segments.noise() if report.could_be_gyros else None for report in reports
     ]
+    forces = [report.force_noise for report in reports]
 
     def of_values(figure: Callable[[TopicReport], object]) -> list[object]:
         return [figure(report) if report.could_be_gyros else None for report in reports]
@@ -365,6 +383,8 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
             "moving_noise", [one and one.moving for one in gyros], ("in motion",), noise
         ),
         Column("moving_share", [one and one.share for one in gyros]),
+        Column("accelerometer_quiet_noise", [one and one.quiet for one in forces]),
+        Column("accelerometer_moving_noise", [one and one.moving for one in forces]),
         Column("", [_gyros(report, unit) for report in reports], ("content",)),
     ]
 
@@ -407,6 +427,11 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
         if report.complete
         else []
     )
+    if (noise := report.force_noise) is not None and np.isfinite(noise.quiet).any():
+        low, high = np.nanmin(noise.quiet), np.nanmax(noise.quiet)
+        words.append(
+            f"{report.channels} accelerometers, noise {low:.2g} to {high:.2g} {FORCE.unit}"
+        )
     return ", ".join([*words, *troubles(report, unit)])
 
 

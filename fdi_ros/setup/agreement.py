@@ -15,8 +15,10 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdi_ros.errors import DisagreementError
 from fdi_ros.estimator.shared_noise import UNEQUAL
@@ -30,7 +32,7 @@ from fdi_ros.inspection.turns import (
     find_turn,
 )
 from fdi_ros.model.geometry import Geometry, spans_space
-from fdi_ros.model.samples import Array
+from fdi_ros.model.samples import Array, Int
 from fdi_ros.setup.blocks import Data
 
 #: smallest response of a channel to the rotation of others, and the reverse
@@ -38,6 +40,7 @@ LEAST_RESPONSE = 0.3
 #: Share of rotation in common from which two units show one rotation, along other axes
 #: or on another scale.
 SAME = 0.9
+_OR_EXCLUDE = "or name its channels in excluded_channels"
 SIGNED_AXES = [  # all 48 ways to swap and reverse three axes
     np.eye(3)[list(order)] * np.array(signs)[:, None]
     for order in itertools.permutations(range(3))
@@ -64,76 +67,126 @@ def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) 
         _check_response(moving, nominal)
 
 
+class _Turns(NamedTuple):
+    """Rotation as each of u units shows it, while they move."""
+
+    #: (u, 3) channels of each unit
+    units: list[list[int]]
+    #: (u,) names
+    names: list[str]
+    #: (W, n) rates of the channels, rad/s
+    means: Array
+    #: (u, W, 3) rates of the units in the body frame, by their configured axes, rad/s
+    rates: list[Array]
+    #: (u, u) size of the rotation in a unit over that in another
+    ratio: Array
+
+
 def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> None:
     """Refuse a unit with another scale than most, such as deg/s, or with other axes."""
+    turns = _turns_of(means, nominal)
+    if turns is None:
+        return
+    alike = _have_one_scale(turns)
+    # Axes of unknown mounts cannot be compared.
+    known = [not {*unit} & {*unknown} for unit in turns.units]
+    along_same_axes = [
+        [
+            not (known[k] and known[j]) or _in_common(one, other) > SHARED
+            for j, other in enumerate(turns.rates)
+        ]
+        for k, one in enumerate(turns.rates)
+    ]
+    agree = alike & np.array(along_same_axes)
+    most = np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
+    odd = next((k for k in range(len(turns.units)) if k not in most), None)
+    if odd is None:
+        return
+    if alike[odd, most].all():
+        raise DisagreementError(_other_axes(turns, nominal, odd, most))
+    if 2 * len(most) > len(turns.units):
+        ratio = np.median(turns.ratio[odd, most])
+        raise DisagreementError(
+            f"{turns.names[odd]} measures {ratio:.3g} times the rotation of"
+            f" {_joined(turns, most)}: repair it {_OR_EXCLUDE}"
+        )
+    raise DisagreementError(_other_rotations(turns))
+
+
+def _turns_of(means: Array, nominal: Geometry) -> _Turns | None:
+    """Return the rotation of the units, or None if fewer than two turn for long enough."""
     units = [
         list(unit)
         for unit in nominal.units
         if len(unit) == 3 and spans_space(nominal.axes[list(unit)])
     ]
     if len(units) < 2:
-        return
+        return None
     turning = np.array([np.linalg.norm(means[:, unit], axis=1) for unit in units])
     moving = np.median(turning, axis=0) >= LEAST_ROTATION
     if moving.sum() < LEAST_WINDOWS:
-        return
+        return None
     turning = np.maximum(turning[:, moving], 1e-9)
     means = means[moving]
-    ratio = np.median(turning[:, None] / turning[None], axis=2)
-    # Along the directions in which each unit turns most to least: one bad axis is not the scale of the unit.
-    along = np.sqrt(
-        np.maximum(
-            [np.linalg.eigvalsh(np.cov(means[:, unit].T)) for unit in units], 1e-18
-        )
-    )
-    least = np.maximum(ratio, (along[:, None] / along[None]).max(axis=2))
-    alike = (least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE)
-    rates = [means[:, unit] @ np.linalg.inv(nominal.axes[unit]).T for unit in units]
-    # Axes of unknown mounts cannot be compared.
-    known = [not {*unit} & {*unknown} for unit in units]
-    turn = [
-        [
-            not (known[k] and known[j]) or _in_common(one, other) > SHARED
-            for j, other in enumerate(rates)
-        ]
-        for k, one in enumerate(rates)
-    ]
-    agree = alike & np.array(turn)
-    most = np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
-    odd = next((k for k in range(len(units)) if k not in most), None)
-    if odd is None:
-        return
     names = [
         nominal.channel_names[unit[0]].rpartition(".")[0] or "one triad"
         for unit in units
     ]
-    name = names[odd]
-    others = " and ".join(names[k] for k in most)
-    mend = "or name its channels in excluded_channels"
-    if alike[odd, most].all():
-        doubt = (
-            ""
-            if len(most) > 1
-            else " (or the other one is wrong: two units cannot tell)"
+    rates = [means[:, unit] @ np.linalg.inv(nominal.axes[unit]).T for unit in units]
+    ratio = np.median(turning[:, None] / turning[None], axis=2)
+    return _Turns(units, names, means, rates, ratio)
+
+
+def _have_one_scale(turns: _Turns) -> NDArray[np.bool_]:
+    """Return (u, u) whether two units measure rotation on one scale.
+
+    They are compared along the directions in which each unit turns most to least: one
+    bad axis does not change the scale of the unit.
+    """
+    variances = [np.linalg.eigvalsh(np.cov(turns.means[:, u].T)) for u in turns.units]
+    along = np.sqrt(np.maximum(variances, 1e-18))
+    least = np.maximum(turns.ratio, (along[:, None] / along[None]).max(axis=2))
+    return (least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE)
+
+
+def _joined(turns: _Turns, chosen: Int) -> str:
+    """Name several units."""
+    return " and ".join(turns.names[k] for k in chosen)
+
+
+def _other_axes(turns: _Turns, nominal: Geometry, odd: int, most: Int) -> str:
+    """Describe a unit that turns as much as the others, along other axes."""
+    unit = turns.units[odd]
+    doubt = (
+        "" if len(most) > 1 else " (or the other one is wrong: two units cannot tell)"
+    )
+    rate = np.mean([turns.rates[k] for k in most], axis=0)
+    expected = rate @ nominal.axes[unit].T
+    shares = [
+        _in_common(turns.means[:, unit], expected @ signed.T) for signed in SIGNED_AXES
+    ]
+    if max(shares) < SAME:
+        return (
+            f"{turns.names[odd]} does not measure the rotation of {_joined(turns, most)}"
+            f" ({max(*shares, 0.0):.0%} shared): its mount in the config is wrong, it is not"
+            f" on the same body, or its clock is off by seconds{doubt}"
         )
-        true = np.mean([rates[k] for k in most], axis=0) @ nominal.axes[units[odd]].T
-        shares = [
-            _in_common(means[:, units[odd]], true @ signed.T) for signed in SIGNED_AXES
-        ]
-        words = f"{name} {_wrong_axes(SIGNED_AXES[int(np.argmax(shares))])}, unlike {others}{doubt}: correct its"
-        words += f" driver or mount, {mend}"
-        if max(shares) < SAME:
-            words = f"{name} does not measure the rotation of {others} ({max(*shares, 0.0):.0%} shared): its mount"
-            words += f" in the config is wrong, it is not on the same body, or its clock is off by seconds{doubt}"
-    elif 2 * len(most) > len(units):
-        words = f"{name} measures {np.median(ratio[odd, most]):.3g} times the rotation of {others}: repair it {mend}"
-    else:
-        low, high = (
-            int(pick(np.median(ratio, axis=1))) for pick in (np.argmin, np.argmax)
-        )
-        words = f"{' and '.join(names)} measure different rotations, and the data cannot tell which is right:"
-        words += f" {names[high]} measures {ratio[high, low]:.3g} times the rotation of {names[low]}; repair one"
-    raise DisagreementError(words)
+    return (
+        f"{turns.names[odd]} {_wrong_axes(SIGNED_AXES[int(np.argmax(shares))])},"
+        f" unlike {_joined(turns, most)}{doubt}: correct its driver or mount, {_OR_EXCLUDE}"
+    )
+
+
+def _other_rotations(turns: _Turns) -> str:
+    """Describe units of which no majority measures one rotation."""
+    typical = np.median(turns.ratio, axis=1)
+    low = int(typical.argmin())
+    high = int(typical.argmax())
+    return (
+        f"{' and '.join(turns.names)} measure different rotations, and the data cannot tell"
+        f" which is right: {turns.names[high]} measures {turns.ratio[high, low]:.3g} times"
+        f" the rotation of {turns.names[low]}; repair one"
+    )
 
 
 def _wrong_axes(signed: Array) -> str:

@@ -229,7 +229,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
             os.replace(part, path)
-        except BaseException:
+        except BaseException:  # Leave no part of a file, also if interrupted.
             with contextlib.suppress(OSError):
                 os.unlink(part)
             raise

@@ -48,6 +48,34 @@ def test_rates_gaps_and_noise_are_found(tmp_path):
     assert first.largest == pytest.approx(1.4, abs=0.2)
 
 
+def test_the_noise_of_accelerometers_is_found_where_there_are_any(tmp_path, fdi):
+    """The second unit has none: its messages say so, or have zeros."""
+    random = np.random.default_rng(0)
+    noise = np.array([0.05, 0.1, 0.3])
+    messages = []
+    for k in range(2000):
+        at = START + k * STEP
+        force = tuple(np.array([0.0, 0.0, 9.81]) + noise * random.normal(size=3))
+        absent = None if k % 2 else (0.0, 0.0, 0.0)
+        for topic, felt in zip(TOPICS, (force, absent), strict=True):
+            rate = random.normal(0.0, 0.01, 3)
+            messages.append((topic, at, imu(at, rate, force=felt)))
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    first, second = inspect(path)[0]
+    np.testing.assert_allclose(first.force_noise.quiet, noise, rtol=0.1)
+    assert first.force_noise.share == 0.0
+    assert second.force_noise is None
+    said = fdi("inspect", path).out
+    assert "3 accelerometers, noise 0.05 to 0.3 m/s^2" in said
+    assert said.count("accelerometers") == 1
+    figures = tmp_path / "figures.json"
+    assert fdi("inspect", path, "--json", figures).code == 0
+    topics = json.loads(figures.read_text())["topics"]
+    found = [one.get("accelerometer_quiet_noise") for one in topics]
+    np.testing.assert_allclose(found[0], noise, rtol=0.1)
+    assert found[1] is None
+
+
 def test_what_could_be_gyros_and_what_could_not(tmp_path):
     random = np.random.default_rng(0)
     messages = []
