@@ -171,10 +171,11 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
     kind = chosen[0].kind
     assert kind is not None
     rate = max(report.rate for report in chosen)
-    largest = max(report.largest for report in chosen)
+    # A single spike says nothing of the range.
+    largest = np.fmax.reduce([report.lasting for report in chosen])
     at_rest = rate * _REST >= MIN_LEARNED and all(map(_starts_at_rest, chosen))
     largest_rate = _rounded_up(
-        max(*PARAMETERS["health.max_rate"].default, 1.001 * largest)
+        float(np.fmax(max(PARAMETERS["health.max_rate"].default), 1.001 * largest))
     )
     # Values of parameters, and remarks on them.
     known: dict[str, tuple[Any, str]] = {

@@ -76,6 +76,8 @@ class TopicReport:
     announced: int = 0
     #: largest possible rate, rad/s, or NaN
     largest: float = math.nan
+    #: largest rate in two messages in a row, rad/s, or NaN: a spike is in one
+    lasting: float = math.nan
     #: s, of the first million messages
     intervals: list[Array] = field(default_factory=list)
     #: s, from stamp to stamp, of the first million messages
@@ -223,6 +225,11 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     report.beyond += (finite & ~believed).sum(axis=0)
     if believed.any():
         report.largest = float(np.fmax(report.largest, np.abs(values[believed]).max()))
+    sizes = np.abs(np.vstack([report.recent[-1:], values]))
+    pairs = np.maximum(sizes[1:], sizes[:-1]) < BELIEVED
+    if pairs.any():
+        lasting = np.minimum(sizes[1:], sizes[:-1])[pairs].max()
+        report.lasting = float(np.fmax(report.lasting, lasting))
     report.recent = np.vstack([report.recent, values])[-RECENT:]
     whole = believed.all(axis=1)
     report.segments.add(values[whole], times[whole], report.rate)

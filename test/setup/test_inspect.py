@@ -268,3 +268,18 @@ def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, fdi, refused):
     assert f"has no gyros for a monitor: needs {NEEDED}" in error
     assert "/nan (sensor_msgs/msg/Imu, 20 messages)" in error
     assert not made.exists()
+
+
+@pytest.mark.parametrize(
+    ("rate", "samples", "limit"), [(60.0, 1, 35.0), (35.5, 20, 36.0)]
+)
+def test_a_spike_does_not_raise_the_range_but_a_fast_turn_does(
+    tmp_path, rate, samples, limit
+):
+    """A spike lasts one sample, a turn 0.2 s."""
+    stamp = START + STEP * np.arange(1000)
+    z = 0.002 * np.random.default_rng(0).standard_normal((1000, 6))
+    z[500 : 500 + samples, 2] = rate
+    path = write_mcap(tmp_path / "bag.mcap", imu_messages(stamp, z, TOPICS[:2]))
+    (found,) = starting_config_of(path, "refused").parameters["health.max_rate"]
+    assert found == limit
