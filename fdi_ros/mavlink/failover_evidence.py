@@ -38,6 +38,9 @@ CLEAR = 0.5
 #: Share of the rate by which two healthy gyros may differ: scales of one type differ by up
 #: to 3 %, which is more than `CLEAR` in a turn of 17 rad/s.
 SCALE = 0.05
+#: An error is no oscillation if its mean is this share of its standard deviation. A mean of
+#: 120 ms leaves less of a vibration faster than 11 Hz.
+STEADY = 1 / 3
 SKEW = 20 * MS  #: Two IMUs may measure this far apart in time, ns.
 QUICK = 50 * MS  #: All samples of this time must differ by `LARGE` or `CLEAR`, ns,
 FEWEST = 3  #: and this number of samples.
@@ -72,6 +75,7 @@ class Difference(NamedTuple):
 
     mean: Vector  #: rad/s
     std: Vector  #: Standard deviation of the mean, rad/s.
+    spread: Vector  #: Standard deviation of one difference, rad/s. 0: not known.
 
     @property
     def size(self) -> float:
@@ -180,11 +184,10 @@ class RawComparison:
             return None
         count = len(rows)
         mean = np.mean(rows, axis=0)
+        spread = np.std(rows, axis=0, ddof=min(1, count - 1))
         # With one pair nothing is known of the noise.
-        std = np.full(3, math.inf)
-        if count > 1:
-            std = np.std(rows, axis=0, ddof=1) / math.sqrt(count)
-        return Difference(tuple(mean.tolist()), tuple(std.tolist()))
+        std = spread / math.sqrt(count) if count > 1 else np.full(3, math.inf)
+        return Difference(*(tuple(row.tolist()) for row in (mean, std, spread)))
 
     def _latest(
         self, unit: int, other: int, count: int, now: int
@@ -321,7 +324,10 @@ class Evidence:
         return self.imus
 
     def _compare(self, units: Sequence[int], now: int) -> Apart:
-        """Return by how much more than scales explain each pair differs, by axis, rad/s."""
+        """Return by how much each pair differs, by axis, rad/s.
+
+        Less what scales explain. 0 for what a mean leaves of an oscillation.
+        """
         found: Apart = {}
         for j, k in combinations(units, 2):
             difference = self.raw.between(j, k, now)
@@ -329,7 +335,10 @@ class Evidence:
                 found[j, k] = found[k, j] = UNKNOWN
                 continue
             scale = SCALE * min(self.raw.rate(j), self.raw.rate(k))
-            x, y, z = (max(0.0, abs(mean) - scale) for mean in difference.mean)
+            x, y, z = (
+                max(0.0, abs(mean) - scale) if abs(mean) >= STEADY * spread else 0.0
+                for mean, spread in zip(difference.mean, difference.spread, strict=True)
+            )
             found[j, k] = found[k, j] = x, y, z
         return found
 
@@ -480,7 +489,7 @@ class Evidence:
         ]
         if not found:
             return None
-        mean, std = min(found)[2]
+        mean, std, _ = min(found)[2]
         axis = max(range(3), key=lambda k: abs(mean[k]))
         others = [abs(mean[k]) for k in range(3) if k != axis]
         if max(others) > WHOLE * abs(mean[axis]):
