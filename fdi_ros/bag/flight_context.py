@@ -70,7 +70,8 @@ class Thinned:
         low, high = self._range
         value = value.astype(np.float64)
         good = np.isfinite(value) & (value >= low) & (value <= high)
-        stamp, value = stamp[good].astype(np.int64), value[good]
+        stamp = stamp[good].astype(np.int64)
+        value = value[good]
         for k in np.flatnonzero(np.diff(stamp // self._interval, prepend=-1)).tolist():
             at = int(stamp[k])
             if self._stamps and 0 <= at - self._stamps[-1] < self._interval:

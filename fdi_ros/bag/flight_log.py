@@ -323,7 +323,8 @@ class FlightLog(BagFile):
         origins: dict[str, str] = {}
         temperatures: dict[str, Course] = {}
         for source in self._sources:
-            topic, device = self._topic(source), self.devices.get(source.instance)
+            topic = self._topic(source)
+            device = self.devices.get(source.instance)
             named = "" if device is None else f", device {device}"
             origins[topic] = f"{self.origin(source)}{named}"
             course = self.temperatures[source.instance].course(self._shift)

@@ -60,7 +60,8 @@ def ardupilot_mode(vehicle: str, number: int) -> str:
 
 def px4_heartbeat_mode(custom_mode: int) -> str:
     """Return the name of the mode in a HEARTBEAT of PX4."""
-    main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
+    main = custom_mode >> 16 & 0xFF
+    sub = custom_mode >> 24 & 0xFF
     name = _PX4_MAIN.get(main, f"mode {main}")
     return f"{name} {_PX4_AUTO[sub]}" if main == 4 and sub in _PX4_AUTO else name
 

@@ -162,25 +162,30 @@ def forget_evidence(params: Constants, state: State) -> None:
 @compiled
 def look_for_case(params: Constants, state: State) -> None:
     """Open a case on the time scale whose evidence best stands against the noise of the same time."""
-    kf, case, best, found = state.estimator, state.case, math.log(params.limit), False
+    kf = state.estimator
+    case = state.case
+    best = math.log(params.limit)
+    found = False
     for at in range(SCALES):
-        scale, largest, channel, sign = state.scales[at], 0.0, -1, 1.0
+        scale = state.scales[at]
+        largest = 0.0
+        channel = -1
+        sign = 1.0
         for i in range(params.sensors.n):
             for side in range(2):
                 for s in range(SIZES):
                     if scale.sums[side, i, s] > largest:
-                        largest, channel, sign = (
-                            scale.sums[side, i, s],
-                            i,
-                            1.0 - 2.0 * side,
-                        )
+                        largest = scale.sums[side, i, s]
+                        channel = i
+                        sign = 1.0 - 2.0 * side
         if channel < 0 or largest < params.limit:
             continue
         since, evidence = look_back(params, kf, scale, channel, sign)
         evidence = min(evidence, since * math.log(kf.noise.cap[at, channel]))
         samples = max(PER_BLOCK[at] * params.length, 1)
         if since >= 2 and since * samples >= params.least and evidence >= best:
-            best, found = evidence, True
+            best = evidence
+            found = True
             case.onset = scale.first[(scale.newest - since + 1 + KEPT) % KEPT]
     if found:
         open_case(params, state)
@@ -193,7 +198,10 @@ def look_for_drift(params: Constants, state: State) -> None:
     An estimate has the variance by which the prior variance has fallen, so
     ``x^2 / (prior - P)`` is the square of a standard normal value.
     """
-    kf, case, layout, worst = state.estimator, state.case, params.layout, 0.0
+    kf = state.estimator
+    case = state.case
+    layout = params.layout
+    worst = 0.0
     if case.moved > 0.0 and kf.seconds - case.moved_at < LONGEST_DRIFT:
         return
     for r in range(layout.n, layout.count):
@@ -216,7 +224,10 @@ def look_for_change_in_hole(params: Constants, state: State) -> None:
 
     Shortly after a hole slow noise is unknown, and the states absorb what the sums do not see.
     """
-    kf, case, n, worst = state.estimator, state.case, params.sensors.n, 0.0
+    kf = state.estimator
+    case = state.case
+    n = params.sensors.n
+    worst = 0.0
     information = kf.parity.information
     before = case.before
     if (
@@ -248,9 +259,12 @@ def open_case(params: Constants, state: State) -> None:
 
     A hypothesis stands where its log odds, with every uncertainty counted, pass `STANDS`.
     """
-    kf, case = state.estimator, state.case
+    kf = state.estimator
+    case = state.case
     case.onset = max(case.onset, 1)
-    case.open, case.candidate, case.isolated = True, 0, 0
+    case.open = True
+    case.candidate = 0
+    case.isolated = 0
     case.suspects = case.witnesses = 0
     case.unsolved = 0.0
     copy_states(params.layout, kf.states, case.before)
@@ -302,8 +316,11 @@ def block_shows_others(params: Constants, state: State, named: int, place: int) 
 
     The correlations are those of the block itself: they change with the motion.
     """
-    kf, inference, n = state.estimator, state.case.inference, params.sensors.n
-    information, count = state.information[place], 0
+    kf = state.estimator
+    inference = state.case.inference
+    n = params.sensors.n
+    information = state.information[place]
+    count = 0
     for i in range(n):
         if named >> i & 1:
             if count == 3 or not information[i, i] > 0.0:
@@ -337,7 +354,9 @@ def shows_other(
 
     ``amplitude`` holds the regression of channel j on each of the named channels.
     """
-    values, largest, p = state.scales[BLOCK].series[place], 0.0, 0
+    values = state.scales[BLOCK].series[place]
+    largest = 0.0
+    p = 0
     other = values[j]
     for i in range(params.sensors.n):
         if named >> i & 1:
@@ -370,13 +389,16 @@ def widen(params: Constants, state: State) -> None:
         if holds and not shows_others(params, state, inside):
             inference.union = inside
             return
-    inference.union, inference.fitted = inference.judged, False
+    inference.union = inference.judged
+    inference.fitted = False
 
 
 @compiled
 def name_channels(params: Constants, state: State) -> None:
     """Name the channels that explain the mean since the onset, or the last half of a long one."""
-    kf, case, inference = state.estimator, state.case, state.case.inference
+    kf = state.estimator
+    case = state.case
+    inference = state.case.inference
     size = kf.samples - case.onset + 1
     if is_after_hole(params, kf):
         # Moves in the hole are in the variances of the biases.
@@ -416,12 +438,10 @@ def gives_up(params: Constants, state: State, seconds: float) -> bool:
     The errors of the sensors are as uncertain as at the start then, and their biases by
     what the channels differ.
     """
-    kf, case, layout, inference = (
-        state.estimator,
-        state.case,
-        params.layout,
-        state.case.inference,
-    )
+    kf = state.estimator
+    case = state.case
+    layout = params.layout
+    inference = state.case.inference
     unsolved = case.isolated == 0 and not inference.fitted
     case.unsolved = max(case.unsolved + (seconds if unsolved else -seconds), 0.0)
     if params.bias_move == 0.0 or case.unsolved < UNSOLVED:
@@ -469,7 +489,8 @@ def isolate(params: Constants, kf: Estimator, case: Case) -> None:
     """Isolate the channels that all likely hypotheses have had in common for long enough."""
     inference = case.inference
     if inference.common != case.candidate:
-        case.candidate, case.since = inference.common, kf.samples
+        case.candidate = inference.common
+        case.since = kf.samples
     stood = (kf.samples - case.since) * params.period
     # A single outlying value decides nothing, whatever the odds.
     may_be_spike = 0 < kf.far_samples < params.least
@@ -507,7 +528,8 @@ def keep_suspects(case: Case) -> None:
     """
     inference = case.inference
     if inference.union & case.suspects:
-        inference.common, inference.union = case.isolated, case.suspects
+        inference.common = case.isolated
+        inference.union = case.suspects
         inference.fitted = True
 
 
@@ -517,11 +539,15 @@ def let_biases_move(params: Constants, state: State, std: float) -> bool:
 
     Returns whether the move was accepted.
     """
-    kf, case, n = state.estimator, state.case, params.sensors.n
+    kf = state.estimator
+    case = state.case
+    n = params.sensors.n
     lately = case.moved * math.exp(-(kf.seconds - case.moved_at) / WARMS) + std
     if lately > LARGEST_MOVE or std > LARGEST_STEP:
         return False
-    case.moved, case.moved_at, case.moved_since = lately, kf.seconds, case.onset
+    case.moved = lately
+    case.moved_at = kf.seconds
+    case.moved_since = case.onset
     for i in range(n):
         case.reference[i] = kf.states.x[i]
     move_biases(params, kf, std, 0.5 * LARGEST_MOVE / WARMS)
@@ -535,7 +561,9 @@ def let_biases_move(params: Constants, state: State, std: float) -> bool:
 @compiled
 def goes_too_far(params: Constants, state: State) -> bool:
     """Whether a bias has gone farther or faster than a move of all biases may: a fault, not a move."""
-    kf, case, feeds = state.estimator, state.case, params.layout.feeds
+    kf = state.estimator
+    case = state.case
+    feeds = params.layout.feeds
     if case.moved == 0.0 or kf.seconds - case.moved_at > WARMS:
         return False
     for r in range(params.layout.count):
@@ -555,18 +583,17 @@ def goes_too_far(params: Constants, state: State) -> bool:
 def undo_move(params: Constants, state: State) -> None:
     """Open a case at the onset of a supposed move of all biases, and accept no move for `WARMS`."""
     case = state.case
-    case.onset, case.moved, case.moved_at = (
-        case.moved_since,
-        math.e * LARGEST_MOVE,
-        state.estimator.seconds,
-    )
+    case.onset = case.moved_since
+    case.moved = math.e * LARGEST_MOVE
+    case.moved_at = state.estimator.seconds
     open_case(params, state)
 
 
 @compiled
 def leave_aside(params: Constants, state: State) -> None:
     """Keep doubtful channels out of the learned states, and out of the rate if the others give one."""
-    kf, case = state.estimator, state.case
+    kf = state.estimator
+    case = state.case
     kf.under_test = case.suspects | case.isolated
     kf.excluded_from_rate = 0
     for wanted in (kf.under_test, case.isolated, case.inference.likeliest):
@@ -578,7 +605,8 @@ def leave_aside(params: Constants, state: State) -> None:
 @compiled
 def follow_case(params: Constants, state: State) -> None:
     """Name the channels of an open case again when it has grown, and end it without evidence."""
-    kf, case = state.estimator, state.case
+    kf = state.estimator
+    case = state.case
     if kf.samples < case.next:
         return
     name_channels(params, state)

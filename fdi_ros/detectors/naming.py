@@ -147,7 +147,9 @@ def set_mean_speed(
 @compiled
 def set_mean(params: Constants, kf: Estimator, inference: Inference, size: int) -> None:
     """Set up the mean of the last ``size`` samples and its covariance."""
-    n, layout, before = params.sensors.n, params.layout, inference.before
+    n = params.sensors.n
+    layout = params.layout
+    before = inference.before
     total_before(kf, kf.samples - size + 1, before, n)
     # Sums exist only for some earlier moments.
     size = kf.samples - before.sample
@@ -170,7 +172,8 @@ def fill_mean(
     params: Constants, kf: Estimator, inference: Inference, size: int
 ) -> None:
     """Compute the means of the values and of the motion since ``before``."""
-    n, before = params.sensors.n, inference.before
+    n = params.sensors.n
+    before = inference.before
     inference.mask = 0
     for i in range(n):
         count = kf.total.count[i] - before.count[i]
@@ -193,7 +196,8 @@ def fill_mean(
 @compiled
 def noise_of_mean(params: Constants, noise: Noise, i: int, size: int) -> float:
     """Return the noise variance of the mean of ``size`` samples of channel i, (rad/s)^2."""
-    variance, slow = noise.now.sample[i], noise.longest[i]
+    variance = noise.now.sample[i]
+    slow = noise.longest[i]
     if size >= params.length:
         colour = max(1.0, noise.now.level[BLOCK, i] * slow)
         variance *= noise.unknown[i] * colour
@@ -228,7 +232,8 @@ def add_noise(
 @compiled
 def add_line(params: Constants, kf: Estimator, inference: Inference, size: int) -> None:
     """Add vibration to the covariance: channels with the same line are not independent."""
-    n, longest = params.sensors.n, kf.noise.longest
+    n = params.sensors.n
+    longest = kf.noise.longest
     for i in range(n):
         for j in range(n):
             slow = 1.0
@@ -249,7 +254,8 @@ def checks(mask: int, n: int) -> int:
 @compiled
 def reduce(inference: Inference, n: int, k: int) -> None:
     """Compute D' u and D' A D for the first k directions."""
-    direction, information = inference.direction, inference.parity.information
+    direction = inference.direction
+    information = inference.parity.information
     for p in range(k):
         inference.along[p] = dot(direction[p], inference.u, n)
         for q in range(p + 1):
@@ -274,7 +280,8 @@ def log_ratio(inference: Inference, n: int, k: int, given: float) -> float:
         if not inference.matrix[p, p] > 0.0:
             return NO_LOG
     invert(inference.matrix, k, inference.inverse)
-    inference.fit, t = 0.0, given
+    inference.fit = 0.0
+    t = given
     for p in range(k):
         inference.amplitude[p] = dot(inference.inverse[p], inference.along, k)
         inference.fit += 0.5 * inference.amplitude[p] * inference.along[p]
@@ -306,14 +313,10 @@ def add(
             inference.errors[inference.count, i] += (
                 inference.direction[p, i] * inference.amplitude[p]
             )
-    inference.odds[inference.count], inference.fits[inference.count] = (
-        log_odds,
-        inference.fit,
-    )
-    inference.members[inference.count], inference.whole[inference.count] = (
-        members,
-        whole,
-    )
+    inference.odds[inference.count] = log_odds
+    inference.fits[inference.count] = inference.fit
+    inference.members[inference.count] = members
+    inference.whole[inference.count] = whole
     inference.count += 1
 
 
@@ -327,7 +330,8 @@ def set_direction(inference: Inference, n: int, k: int, channel: int) -> None:
 @compiled
 def add_channels(inference: Inference, n: int) -> None:
     """Add each channel, and each pair where enough checks exist."""
-    free, information = checks(inference.mask, n), inference.parity.information
+    free = checks(inference.mask, n)
+    information = inference.parity.information
     for i in range(n):
         inference.error[i] = 0.0
         if inference.judged >> i & 1:
@@ -344,7 +348,9 @@ def add_channels(inference: Inference, n: int) -> None:
     for i in range(n):
         for j in range(i):
             if inference.judged >> i & 1 and inference.judged >> j & 1:
-                aii, ajj, aij = information[i, i], information[j, j], information[i, j]
+                aii = information[i, i]
+                ajj = information[j, j]
+                aij = information[i, j]
                 # One of two indistinguishable channels is enough.
                 if aii * ajj - aij * aij > 1e-3 * aii * ajj:
                     set_direction(inference, n, 0, i)
@@ -362,7 +368,9 @@ def add_channels(inference: Inference, n: int) -> None:
 @compiled
 def add_units(params: Constants, inference: Inference) -> None:
     """Add each whole unit: any errors of its channels, its gain, its delay."""
-    n, axes, rate = params.sensors.n, params.sensors.axes, inference.rate
+    n = params.sensors.n
+    axes = params.sensors.axes
+    rate = inference.rate
     prior = math.log(COINCIDENCE / max(params.units, 1))
     for unit in range(params.units):
         inside = params.members[unit] & inference.mask
@@ -428,10 +436,8 @@ def largest_of(inference: Inference) -> int:
 def update_best(inference: Inference, n: int) -> None:
     """Record the likeliest hypothesis, and whether it leaves only noise."""
     best = largest_of(inference)
-    inference.log_odds, inference.likeliest = (
-        inference.odds[best],
-        inference.members[best],
-    )
+    inference.log_odds = inference.odds[best]
+    inference.likeliest = inference.members[best]
     inference.fit_of_best = inference.fits[best]
     free = checks(inference.mask & ~inference.likeliest, n)
     inference.fitted = 2.0 * (
@@ -451,12 +457,16 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
     that measures motion wrongly, all gyros may be healthy and no channel is named.
     """
     update_best(inference, n)
-    top, total = inference.log_odds, 0.0
+    top = inference.log_odds
+    total = 0.0
     for k in range(inference.count):
         inference.odds[k] = math.exp(max(inference.odds[k] - top, -700.0))
         total += inference.odds[k]
     update_spread(inference, n, total)
-    mass, union, common, enough = 0.0, 0, -1, 1.0 - SET_MARGIN * (1.0 - confidence)
+    mass = 0.0
+    union = 0
+    common = -1
+    enough = 1.0 - SET_MARGIN * (1.0 - confidence)
     some_whole = False
     for _ in range(inference.count):
         if mass >= confidence * total:

@@ -112,7 +112,8 @@ SHORT = (
 @compiled
 def begin(params: Constants, state: State, sample: SampleInput) -> None:
     """Start the states and the noise from their priors."""
-    kf, n = state.estimator, params.sensors.n
+    kf = state.estimator
+    n = params.sensors.n
     state.begun = True
     if not state.restored:
         begin_states(params.layout, kf.states, sample.bias_std)
@@ -146,13 +147,15 @@ def pass_time(params: Constants, state: State, sample: SampleInput) -> float:
 @compiled
 def update_mask(params: Constants, state: State, sample: SampleInput) -> None:
     """Adopt the set of present channels, and end the case once its channels are excluded."""
-    kf, case = state.estimator, state.case
+    kf = state.estimator
+    case = state.case
     blamed = case.isolated if case.isolated else case.suspects
     if case.open and blamed & ~sample.out == 0:
         forget_evidence(params, state)
         kf.mask = 0
     if sample.mask != kf.mask or sample.beyond != kf.beyond:
-        kf.mask, kf.beyond = sample.mask, sample.beyond
+        kf.mask = sample.mask
+        kf.beyond = sample.beyond
         update_weights(params, kf)
         if sample.wants_excess:
             update_excess(params, kf)
@@ -161,8 +164,11 @@ def update_mask(params: Constants, state: State, sample: SampleInput) -> None:
 @compiled
 def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     """Process a complete block: noise, states, and evidence on the longer time scales."""
-    kf, case, n = state.estimator, state.case, params.sensors.n
-    noise, learns = kf.noise, not case.open
+    kf = state.estimator
+    case = state.case
+    n = params.sensors.n
+    noise = kf.noise
+    learns = not case.open
     close_turn(params, kf)
     update_largest_rate(
         noise, kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
@@ -231,7 +237,8 @@ def take_delays_off(params: Constants, state: State) -> None:
 @compiled
 def look_for_slow_faults(params: Constants, state: State) -> None:
     """Look for slow faults, which show in the states but not in the sums."""
-    kf, case = state.estimator, state.case
+    kf = state.estimator
+    case = state.case
     if kf.judged and not case.open and kf.samples >= case.retry:
         look_for_drift(params, state)
         look_for_change_in_hole(params, state)
@@ -244,11 +251,13 @@ def forget_suspicion(params: Constants, state: State) -> None:
     A clock that was set is not a lasting fault, so the delay of a unit that was declared
     as a whole is estimated again.
     """
-    kf, case = state.estimator, state.case
+    kf = state.estimator
+    case = state.case
     inflate_delays(
         params, kf, state.declared | (case.isolated | case.suspects if case.open else 0)
     )
-    state.cleared, state.declared = False, 0
+    state.cleared = False
+    state.declared = 0
     forget_evidence(params, state)
     forget_motion(kf, params.sensors.n)
     kf.mask = 0
@@ -293,7 +302,9 @@ def fill_verdict(
     params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
     """Fill the verdict, and the estimated sensor errors of the sample."""
-    kf, case, n = state.estimator, state.case, params.sensors.n
+    kf = state.estimator
+    case = state.case
+    n = params.sensors.n
     unsure = case.open and case.isolated == 0
     # The channels may disagree beyond the model, as in a shock at unequal sampling instants.
     odd = 1.0 if case.open else kf.odd
@@ -301,10 +312,8 @@ def fill_verdict(
     for i in range(n):
         variance = kf.shared.level[i] * odd
         verdict.noise[i] = math.sqrt(variance / params.expected[i])
-        sample.estimate.corrected[i], sample.estimate.variance[i] = (
-            kf.corrected[i],
-            variance,
-        )
+        sample.estimate.corrected[i] = kf.corrected[i]
+        sample.estimate.variance[i] = variance
         sample.estimate.bias[i] = kf.states.x[i]
         sample.estimate.spikes[i] = kf.spikes[i]
         sample.estimate.bias_std[i] = math.sqrt(kf.states.p[i, i])
@@ -321,16 +330,19 @@ def fill_verdict(
             ):
                 sample.estimate.covariance[i, i] += innovation * innovation
     sample.estimate.excess = kf.excess
-    sample.estimate.behind, sample.estimate.spread = kf.behind, kf.spread
+    sample.estimate.behind = kf.behind
+    sample.estimate.spread = kf.spread
     sample.estimate.checked = 0 if is_blind(kf) else kf.checked
     for u in range(params.units):
         sample.estimate.late[u] = kf.late[u]
     suspects = (case.isolated if case.isolated else case.suspects) & kf.mask
     if case.open and suspects:
-        verdict.alarm, verdict.isolated = True, case.isolated != 0
+        verdict.alarm = True
+        verdict.isolated = case.isolated != 0
         for i in range(n):
             if suspects >> i & 1:
-                verdict.suspects[i], verdict.error[i] = True, case.inference.error[i]
+                verdict.suspects[i] = True
+                verdict.error[i] = case.inference.error[i]
         verdict.statistic = max(verdict.statistic, verdict.threshold)
     else:
         # Evidence that fails against the noise of the same time is no alarm.
@@ -385,7 +397,8 @@ def judge(
 @compiled
 def follow_evidence(params: Constants, state: State, verdict: SampleVerdict) -> None:
     """Follow the open case, or look for one where the mean of the sums reaches the limit."""
-    kf, case = state.estimator, state.case
+    kf = state.estimator
+    case = state.case
     mean = mean_of(params, kf, state.scales)
     verdict.statistic = math.log(1.0 + mean)
     outliers = kf.outliers
@@ -490,11 +503,14 @@ class Sequential(Detector):
                 "louder": louder,
             },
         )
-        params, n, noise = self.constants[0], geometry.n, self.noise
+        params = self.constants[0]
+        n = geometry.n
+        noise = self.noise
         unit = np.zeros(n, dtype=np.int64)
         for u, channels in enumerate(geometry.units):
             unit[list(channels)] = u
-        params["units"], params["unit"][:n] = len(geometry.units), unit
+        params["units"] = len(geometry.units)
+        params["unit"][:n] = unit
         params["members"][: len(geometry.units)] = [
             mask_of(channels) for channels in geometry.units
         ]
@@ -524,7 +540,8 @@ class Sequential(Detector):
         )
         params["gain_is_fault"] = gain_is_fault
         params["louder"] = louder
-        params["rest_std"], params["bias_move"] = REST_STD, bias_move
+        params["rest_std"] = REST_STD
+        params["bias_move"] = bias_move
         used = all_sets(n)
         singular = np.linalg.svd(used[:, :, None] * geometry.axes, compute_uv=False)
         enough = used.sum(axis=1) >= MIN_CHANNELS
@@ -534,7 +551,8 @@ class Sequential(Detector):
         params["determines"][: 1 << n] = determines
         params["spans"][: 1 << n] = enough & determines
         params["least"] = math.ceil(LEAST_TIME * self.sample_rate)
-        params["limit"], params["confidence"] = self.run_length, confidence
+        params["limit"] = self.run_length
+        params["confidence"] = confidence
 
     def clear(self, declared: int = 0) -> None:
         """Drop all suspicion; keep the sensor errors, except the delay of a unit declared as a whole."""

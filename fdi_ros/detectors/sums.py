@@ -80,16 +80,20 @@ def add_evidence(
     params: Constants, kf: Estimator, scale: Scale, at: int, first_sample: int
 ) -> None:
     """Add the last values y of a time scale to its sums, R <- (1 + R) exp(s y - s^2 / 2)."""
-    first, ceiling = FIRST_LONG if at == LONG else 0, CEILING * params.limit
+    first = FIRST_LONG if at == LONG else 0
+    ceiling = CEILING * params.limit
     scale.first[scale.newest] = first_sample
     scale.kept = min(scale.kept + 1, KEPT)
     scale.total = 0.0
     for i in range(params.sensors.n):
         if not kf.judged >> i & 1:
             continue
-        y, cap = scale.series[scale.newest, i], kf.noise.cap[at, i]
+        y = scale.series[scale.newest, i]
+        cap = kf.noise.cap[at, i]
         for side in range(2):
-            sums, total, size = scale.sums[side, i], 0.0, SMALLEST
+            sums = scale.sums[side, i]
+            total = 0.0
+            size = SMALLEST
             factor = math.exp(SMALLEST * min(y if side == 0 else -y, STEP_LIMIT))
             for k in range(SIZES):
                 if k >= first:
@@ -116,9 +120,11 @@ def scatter_of(scale: Scale, i: int, sign: float, count: int, mean: float) -> fl
 
     The larger estimate counts, from single values or from batches.
     """
-    worst, size = 0.0, 1
+    worst = 0.0
+    size = 1
     while count // size >= 4 or size == 1:
-        batches, squares = count // size, 0.0
+        batches = count // size
+        squares = 0.0
         for b in range(batches):
             total = 0.0
             for k in range(b * size, (b + 1) * size):
@@ -141,16 +147,21 @@ def look_back(
         Number of values since the onset, and the logarithm of Student's likelihood ratio
         with the degrees of freedom of the learned noise and of the values.
     """
-    best, since, total = 0.0, 0, 0.0
+    best = 0.0
+    since = 0
+    total = 0.0
     for k in range(scale.kept):
         total += sign * value_at(scale, k, i)
         t = total / math.sqrt(k + 1.0)
         if t > best:
-            best, since = t, k + 1
+            best = t
+            since = k + 1
     if since < 2:
         return since, 0.0
-    mean, trust = best / math.sqrt(since), kf.noise.degrees[i]
-    squares, count = 0.0, 0
+    mean = best / math.sqrt(since)
+    trust = kf.noise.degrees[i]
+    squares = 0.0
+    count = 0
     for j in range(params.sensors.n):
         if kf.judged >> j & 1:
             count += 1
@@ -175,7 +186,8 @@ def update_from_sample(
     params: Constants, kf: Estimator, scales: Scales, learns: bool
 ) -> None:
     """Update noise and sums with the statistics of a sample."""
-    scale, noise = scales[SAMPLE], kf.noise
+    scale = scales[SAMPLE]
+    noise = kf.noise
     noise.seen[SAMPLE] += 1.0
     scale.newest = (scale.newest + 1) % KEPT
     for i in range(params.sensors.n):
@@ -203,8 +215,10 @@ def update_from_block(
     params: Constants, kf: Estimator, scales: Scales, learns: bool
 ) -> None:
     """Update noise and sums of the longer time scales with the innovations of a block."""
-    noise, n = kf.noise, params.sensors.n
-    mask, information = kf.masks[1] & kf.judged, kf.block_parity.information
+    noise = kf.noise
+    n = params.sensors.n
+    mask = kf.masks[1] & kf.judged
+    information = kf.block_parity.information
     for k in range(1, SCALES):
         scale = scales[k]
         for i in range(n):
@@ -239,7 +253,8 @@ def update_from_block(
 @compiled
 def mean_of(params: Constants, kf: Estimator, scales: Scales) -> float:
     """Return the mean of all sums."""
-    total, channels = 0.0, 0
+    total = 0.0
+    channels = 0
     for k in range(SCALES):
         total += scales[k].total
     for i in range(params.sensors.n):

@@ -51,10 +51,13 @@ def update_acceleration(params: Constants, kf: Estimator) -> float:
     contradict that difference, as under vibration faster than a block, ``kf.shaken``
     holds the square of the contradiction.
     """
-    ahead, behind = kf.times[0] - kf.times[1], kf.times[1] - kf.times[2]
-    span, whole = kf.ended[1] - kf.ended[2], kf.times[0] - kf.times[2]
+    ahead = kf.times[0] - kf.times[1]
+    behind = kf.times[1] - kf.times[2]
+    span = kf.ended[1] - kf.ended[2]
+    whole = kf.times[0] - kf.times[2]
     # Second-order differences of means whose samples may be apart by more than others.
-    first, last = behind / (ahead * whole), ahead / (behind * whole)
+    first = behind / (ahead * whole)
+    last = ahead / (behind * whole)
     worst = single = apart = 0.0
     for a in range(3):
         total = alone = 0.0
@@ -62,7 +65,8 @@ def update_acceleration(params: Constants, kf: Estimator) -> float:
             square = kf.fused.gain[a, i] * kf.fused.gain[a, i]
             total += square * kf.noise.now.block[i]
             alone += square * kf.noise.now.sample[i]
-        worst, single = max(worst, total), max(single, alone)
+        worst = max(worst, total)
+        single = max(single, alone)
         kf.acceleration[a] = first * (kf.rates[0, a] - kf.rates[1, a]) + last * (
             kf.rates[1, a] - kf.rates[2, a]
         )
@@ -90,14 +94,18 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
     sampling instants of single channels, and scale errors that are not linear in the
     rate.
     """
-    n, states = params.sensors.n, kf.states
-    ahead, behind = kf.times[0] - kf.times[1], kf.times[1] - kf.times[2]
-    noise, square = update_acceleration(params, kf), 0.0
+    n = params.sensors.n
+    states = kf.states
+    ahead = kf.times[0] - kf.times[1]
+    behind = kf.times[1] - kf.times[2]
+    noise = update_acceleration(params, kf)
+    square = 0.0
     for a in range(3):
         square += kf.acceleration[a] * kf.acceleration[a]
     # At rest a rate on which no channels agree is a fault, not motion.
     turning = square > TURNING * noise + kf.shaken and kf.noise.regime == MOTION
-    kf.turning, kf.turn_noise = turning, noise
+    kf.turning = turning
+    kf.turn_noise = noise
     if kf.noise.regime == REST:
         for i in range(n):
             kf.angular_acceleration[i] = kf.extra[i] = 0.0
@@ -108,10 +116,8 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
             h = params.sensors.axes[i, a]
             along += h * kf.acceleration[a]
             speed += h * kf.rates[1, a]
-            after, before = (
-                (kf.rates[0, a] - kf.rates[1, a]) / ahead,
-                (kf.rates[1, a] - kf.rates[2, a]) / behind,
-            )
+            after = (kf.rates[0, a] - kf.rates[1, a]) / ahead
+            before = (kf.rates[1, a] - kf.rates[2, a]) / behind
             lately += h * after
             jerk += h * 2.0 * (after - before) / (ahead + behind)
         kf.angular_acceleration[i] = along if turning else 0.0
@@ -131,7 +137,9 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
 @compiled
 def judge_block(params: Constants, kf: Estimator) -> float:
     """Work out the innovations A (y - C x) of the block before; return the block's weight: 1, or less if improbable."""
-    n, noise, layout = params.sensors.n, kf.noise, params.layout
+    n = params.sensors.n
+    noise = kf.noise
+    layout = params.layout
     for a in range(3):
         kf.signal_rate[a] = kf.rates[1, a] if noise.regime == MOTION else 0.0
     fill_signals(layout, kf.signal_rate, kf.angular_acceleration, kf.block_at.signals)
@@ -149,9 +157,11 @@ def judge_block(params: Constants, kf: Estimator) -> float:
     subtract_errors(
         layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation
     )
-    chi, information = 0.0, kf.block_parity.information
+    chi = 0.0
+    information = kf.block_parity.information
     for i in range(n):
-        kf.block_values[i], noise.share[i] = 0.0, 1.0
+        kf.block_values[i] = 0.0
+        noise.share[i] = 1.0
         if mask >> i & 1:
             kf.block_values[i] = dot_in(information[i], kf.block_innovation, n, mask)
             chi += kf.block_values[i] * kf.block_innovation[i]
@@ -178,7 +188,9 @@ def unlearnable(error: float, inside: float, square: float) -> float:
 @compiled
 def update_least_variances(params: Constants, kf: Estimator) -> None:
     """Find the variance that each state of the motion keeps at least; biases keep none."""
-    layout, noise, n = params.layout, kf.noise, params.sensors.n
+    layout = params.layout
+    noise = kf.noise
+    n = params.sensors.n
     for r in range(layout.count):
         kf.least_variance[r] = 0.0
     if kf.rest:
@@ -234,7 +246,8 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
 @compiled
 def learn(params: Constants, kf: Estimator, weight: float) -> None:
     """Correct the states by the block before. At rest the rate is zero, so the estimated rate is no signal."""
-    n, layout = params.sensors.n, params.layout
+    n = params.sensors.n
+    layout = params.layout
     kept = kf.masks[1] & ~kf.under_test
     if kf.rest:
         for i in range(n):
@@ -268,12 +281,10 @@ def learn(params: Constants, kf: Estimator, weight: float) -> None:
 @compiled
 def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
     """Predict the covariance of the next samples from the state uncertainty in the present motion."""
-    n, layout, square, ahead = (
-        params.sensors.n,
-        params.layout,
-        0.0,
-        kf.times[0] - kf.times[1],
-    )
+    n = params.sensors.n
+    layout = params.layout
+    square = 0.0
+    ahead = kf.times[0] - kf.times[1]
     for a in range(3):
         change = (kf.rates[0, a] - kf.rates[1, a]) / ahead
         square += change * change
@@ -317,7 +328,8 @@ def update_excess(params: Constants, kf: Estimator) -> None:
     moment, of lasting vibration and of the state uncertainty. The excess is the largest
     ``(A S A)_ii / A_ii``, at least 1.
     """
-    n, information = params.sensors.n, kf.expected_parity.information
+    n = params.sensors.n
+    information = kf.expected_parity.information
     fill_parity(kf.expected_parity, params.sensors, kf.mask, params.expected)
     kf.excess = 1.0
     for i in range(n):

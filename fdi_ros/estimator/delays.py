@@ -28,9 +28,12 @@ def update_time_offsets(params: Constants, kf: Estimator) -> None:
     for u in range(1, params.units):
         late = kf.late[u]
         remaining = late + kf.states.x[params.layout.delays[u]]
-        latest, earliest = max(latest, late), min(earliest, late)
-        most, least = max(most, remaining), min(least, remaining)
-    kf.behind, kf.spread = latest - earliest, most - least
+        latest = max(latest, late)
+        earliest = min(earliest, late)
+        most = max(most, remaining)
+        least = min(least, remaining)
+    kf.behind = latest - earliest
+    kf.spread = most - least
 
 
 @compiled
@@ -39,7 +42,8 @@ def transfer_delays(params: Constants, kf: Estimator) -> bool:
     changed = False
     for u in range(1, params.units):
         place = params.layout.delays[u]
-        delay, variance = kf.states.x[place], kf.states.p[place, place]
+        delay = kf.states.x[place]
+        variance = kf.states.p[place, place]
         if abs(delay) > TAKE_OFF and delay * delay > SURE * variance:
             step = min(
                 max(delay, -LONGEST_DELAY - kf.late[u]), LONGEST_DELAY - kf.late[u]

@@ -24,14 +24,16 @@ DISPLACED = 0.1
 @compiled
 def follow_displacement(params: Constants, kf: Estimator, sample: SampleInput) -> None:
     """Follow the variance by unknown positions, and the turn of the body; a turn that begins counts at once."""
-    n, begins = params.sensors.n, False
+    n = params.sensors.n
+    begins = False
     kf.may_be_apart = False
     for i in range(n):
         kf.position_std[i] = sample.position_std[i]
         kf.may_be_apart = kf.may_be_apart or sample.position_std[i] > 0.0
     if not kf.may_be_apart:
         return
-    spin, turned = sample.spin, kf.total.turned
+    spin = sample.spin
+    turned = kf.total.turned
     speed = spin[0] ** 2 + spin[1] ** 2 + spin[2] ** 2
     for a in range(3):
         kf.total.spin[a] = spin[a]
@@ -67,7 +69,8 @@ def add_displacement_of_block(
     """Add the covariance of the mean of the block before by unknown positions, (rad/s)^2."""
     if not kf.may_be_apart:
         return
-    ahead, behind = kf.times[0] - kf.times[1], kf.times[1] - kf.times[2]
+    ahead = kf.times[0] - kf.times[1]
+    behind = kf.times[1] - kf.times[2]
     spin = kf.spins[1]
     speed = spin[0] ** 2 + spin[1] ** 2 + spin[2] ** 2
     for a in range(3):
@@ -80,9 +83,11 @@ def add_displacement_of_block(
     add_displacement(params, kf, kf.turned, kf.spin_change, covariance)
     for i in range(params.sensors.n):
         # Motion faster than blocks reaches the accelerometers in its own way.
-        h, square = params.sensors.axes[i], 0.0
+        h = params.sensors.axes[i]
+        square = 0.0
         for a in range(3):
-            b, c = (a + 1) % 3, (a + 2) % 3
+            b = (a + 1) % 3
+            c = (a + 2) % 3
             by = h[b] * kf.unresolved[c] - h[c] * kf.unresolved[b]
             square += by * by
         covariance[i, i] += kf.position_std[i] ** 2 * square
@@ -115,10 +120,12 @@ def add_displacement(
     ``turned``: centripetal part (3, 3), rad^2/s^2; ``change``: angular acceleration (3,),
     rad/s^2; ``covariance``: (n, n), (rad/s)^2.
     """
-    n, axes = params.sensors.n, params.sensors.axes
+    n = params.sensors.n
+    axes = params.sensors.axes
     for i in range(n):
         for a in range(3):
-            b, c = (a + 1) % 3, (a + 2) % 3
+            b = (a + 1) % 3
+            c = (a + 2) % 3
             by = axes[i, b] * change[c] - axes[i, c] * change[b]
             for k in range(3):
                 by += axes[i, k] * turned[k, a]

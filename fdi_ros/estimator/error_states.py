@@ -127,7 +127,8 @@ def places_of(name: str, n: int, units: int) -> list[list[int]]:
     """States of a kind: of each channel, or of each unit but the first, one list."""
     at = 0
     for kind in ERROR_KINDS:
-        owners, each = (max(units - 1, 0) if kind.per_unit else n), max(len(kind.by), 1)
+        owners = max(units - 1, 0) if kind.per_unit else n
+        each = max(len(kind.by), 1)
         if kind.name == name:
             return [
                 [at + owner * each + k for k in range(each)] for owner in range(owners)
@@ -152,19 +153,15 @@ def prepare_layout(
     """
     n = len(unit)
     layout["axes"][:n] = axes
-    layout["n"], layout["by"], layout["place"], layout["feeds"], layout["delays"] = (
-        n,
-        MULTIPLIERS,
-        -1,
-        -1,
-        -1,
-    )
+    layout["n"] = n
+    layout["by"] = MULTIPLIERS
+    layout["place"] = -1
+    layout["feeds"] = -1
+    layout["delays"] = -1
     count = signals = 0
     for kind in ERROR_KINDS:
-        owners, own = (
-            places_of(kind.name, n, units),
-            slice(signals, signals + len(kind.by)),
-        )
+        owners = places_of(kind.name, n, units)
+        own = slice(signals, signals + len(kind.by))
         signals = own.stop
         prior, walk = (
             np.broadcast_to(given.get(kind.name, usual), max(n, len(owners)))
@@ -177,7 +174,8 @@ def prepare_layout(
             break
         for owner, places in enumerate(owners):
             count += len(places)
-            layout["prior"][places], layout["walk"][places] = prior[owner], walk[owner]
+            layout["prior"][places] = prior[owner]
+            layout["walk"][places] = walk[owner]
             layout["memory"][places] = kind.memory
             if kind.feeds:
                 layout["feeds"][places] = places_of(kind.feeds, n, units)[owner]
@@ -202,7 +200,9 @@ def begin_states(layout: Layout, states: ErrorStates, bias_std: Array) -> None:
 @compiled
 def predict(layout: Layout, states: ErrorStates, seconds: float) -> None:
     """Predict the states over a time, s: rates of change integrate, and every state walks at random."""
-    x, p, count = states.x, states.p, layout.count
+    x = states.x
+    p = states.p
+    count = layout.count
     for r in range(count):
         to = layout.feeds[r]
         if to >= 0:
@@ -241,13 +241,15 @@ def fill_signals(
 @compiled
 def project(layout: Layout, states: ErrorStates, at: Projection) -> None:
     """Work out P C' and C P C' for ``at.signals``."""
-    n, count = layout.n, layout.count
+    n = layout.n
+    count = layout.count
     for i in range(n):
         row = at.columns[i]
         for r in range(count):
             row[r] = 0.0
         for k in range(SIGNALS):
-            place, share = layout.place[i, k], at.signals[i, k]
+            place = layout.place[i, k]
+            share = at.signals[i, k]
             if place >= 0 and share != 0.0:
                 # P is symmetric: a row is read in place of a column.
                 for r in range(count):
@@ -256,7 +258,8 @@ def project(layout: Layout, states: ErrorStates, at: Projection) -> None:
         for j in range(n):
             total = 0.0
             for k in range(SIGNALS):
-                place, share = layout.place[j, k], at.signals[j, k]
+                place = layout.place[j, k]
+                share = at.signals[j, k]
                 if place >= 0 and share != 0.0:
                     total += share * at.columns[i, place]
             at.covariance[i, j] = total
@@ -302,14 +305,16 @@ def update(
     least
         Least variance of each state (states,); 0: no bound.
     """
-    count, share = layout.count, at.share
+    count = layout.count
+    share = at.share
     for j in range(layout.n):
         if information[j, j] != 0.0:
             fill_gain(layout, at, information, j, weight)
     fill_shares(layout, states, at, information, least)
     for j in range(layout.n):
         if information[j, j] != 0.0:
-            gain, column = at.weighted[j], at.columns[j]
+            gain = at.weighted[j]
+            column = at.columns[j]
             for r in range(count):
                 states.x[r] += share[r] * gain[r] * innovation[j]
                 for c in range(r + 1):

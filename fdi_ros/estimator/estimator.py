@@ -286,7 +286,8 @@ def update_weights(params: Constants, kf: Estimator) -> None:
     The state uncertainty is the same error in all samples until the next block. It
     counts twice the samples of a block, or the sums would treat it as white.
     """
-    n, noise = params.sensors.n, kf.noise
+    n = params.sensors.n
+    noise = kf.noise
     lasting = 2.0 * params.length
     for i in range(n):
         # Nonlinearity bounds what any channel can show in a turn, and is not ignorance.
@@ -323,8 +324,10 @@ def correct_sample(
     params: Constants, kf: Estimator, values: Array, gain: Array
 ) -> None:
     """Correct a sample (n,) by the present states; update its rate, by a gain (3, n), and its innovations."""
-    n, layout = params.sensors.n, params.layout
-    signals, innovation = kf.at.signals, kf.innovation
+    n = params.sensors.n
+    layout = params.layout
+    signals = kf.at.signals
+    innovation = kf.innovation
     fill_signals(layout, kf.zero, kf.angular_acceleration, signals)
     subtract_errors(layout, kf.states, signals, values, innovation)
     apply_gain(gain, n, innovation, kf.rate)
@@ -341,7 +344,8 @@ def correct_sample(
 @compiled
 def watch_for_motion(params: Constants, kf: Estimator) -> None:
     """End rest where the channels agree on a rate."""
-    n, noise = params.sensors.n, kf.noise
+    n = params.sensors.n
+    noise = kf.noise
     speed_squared = square(kf.rate)
     if noise.regime == MOTION or not speed_squared > 0.0:
         return
@@ -380,9 +384,11 @@ def update_statistics(params: Constants, kf: Estimator) -> None:
     """Normalise the innovations of a sample. The state uncertainty grows with the motion."""
     n = params.sensors.n
     more = motion_growth(kf, kf.rate)
-    chi, free = 0.0, -3.0
+    chi = 0.0
+    free = -3.0
     for i in range(n):
-        kf.statistic[i], kf.inflation[i] = 0.0, 1.0
+        kf.statistic[i] = 0.0
+        kf.inflation[i] = 1.0
         if kf.judged >> i & 1:
             total = dot(kf.parity.information[i], kf.innovation, n)
             variance = kf.share[i] + more * (1.0 - kf.share[i])
@@ -403,10 +409,12 @@ def copy_total(n: int, source: Total, target: Total) -> None:
     """Copy sums."""
     target.sample = source.sample
     for i in range(n):
-        target.values[i], target.count[i] = source.values[i], source.count[i]
+        target.values[i] = source.values[i]
+        target.count[i] = source.count[i]
         target.speed[i] = source.speed[i]
     for a in range(3):
-        target.rate[a], target.instant[a] = source.rate[a], source.instant[a]
+        target.rate[a] = source.rate[a]
+        target.instant[a] = source.instant[a]
         target.spin[a] = source.spin[a]
         for b in range(3):
             target.turned[a, b] = source.turned[a, b]
@@ -449,7 +457,8 @@ def add_to_total(kf: Estimator, i: int, value: float) -> None:
 @compiled
 def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) -> bool:
     """Add a sample to the totals and, unless a spike, to the block; return whether the block is complete."""
-    n, total = params.sensors.n, kf.total
+    n = params.sensors.n
+    total = kf.total
     total.sample = kf.samples
     if kf.filled == 0:
         kf.begun = kf.seconds - seconds
@@ -481,19 +490,20 @@ def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) 
 @compiled
 def close_block(params: Constants, kf: Estimator) -> None:
     """Take the means of a block that is complete, and begin the next one."""
-    n, present, middle = params.sensors.n, 0, kf.sum_seconds / params.length
+    n = params.sensors.n
+    present = 0
+    middle = kf.sum_seconds / params.length
     for i in range(n):
         # A unit may be slower than the others.
         if 2.0 * kf.sum_count[i] >= params.length:
             present |= 1 << i
-        kf.means[1, i], kf.means[0, i] = (
-            kf.means[0, i],
-            kf.sum_values[i] / max(kf.sum_count[i], 1.0),
-        )
+        kf.means[1, i] = kf.means[0, i]
+        kf.means[0, i] = kf.sum_values[i] / max(kf.sum_count[i], 1.0)
         kf.middles[1, i] = kf.middles[0, i]
         kf.middles[0, i] = kf.sum_time[i] / max(kf.sum_count[i], 1.0) - middle
         kf.sum_values[i] = kf.sum_count[i] = kf.sum_time[i] = 0.0
-    kf.masks[1], kf.masks[0] = kf.masks[0], present
+    kf.masks[1] = kf.masks[0]
+    kf.masks[0] = present
     for a in range(3):
         kf.rates[2, a], kf.rates[1, a] = kf.rates[1, a], kf.rates[0, a]
         kf.ends[2, a], kf.ends[1, a], kf.ends[0, a] = (
@@ -534,7 +544,8 @@ def total_before(kf: Estimator, sample: int, out: Total, n: int) -> None:
 @compiled
 def drop_block(kf: Estimator, n: int) -> None:
     """Begin the block anew: a block with a hole has no time of its own."""
-    kf.filled, kf.sum_seconds = 0, 0.0
+    kf.filled = 0
+    kf.sum_seconds = 0.0
     for i in range(n):
         kf.sum_values[i] = kf.sum_count[i] = kf.sum_time[i] = 0.0
     for a in range(3):
@@ -545,7 +556,9 @@ def drop_block(kf: Estimator, n: int) -> None:
 def forget_motion(kf: Estimator, n: int) -> None:
     """Begin all anew that is known of the motion."""
     drop_block(kf, n)
-    kf.blocks, kf.rest_count, kf.rest = 0, 0, False
+    kf.blocks = 0
+    kf.rest_count = 0
+    kf.rest = False
     kf.unseen = kf.samples > 0
     for i in range(n):
         kf.angular_acceleration[i] = kf.extra[i] = 0.0

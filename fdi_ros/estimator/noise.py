@@ -205,7 +205,8 @@ def change_regime(noise: Noise, n: int, regime: int, at_least: bool) -> None:
     before = noise.kept[noise.regime]
     after = noise.kept[regime]
     for i in range(n):
-        before.sample[i], before.block[i] = noise.now.sample[i], noise.now.block[i]
+        before.sample[i] = noise.now.sample[i]
+        before.block[i] = noise.now.block[i]
         noise.now.sample[i] = max(
             after.sample[i], noise.now.sample[i] if at_least else 0.0
         )
@@ -229,7 +230,8 @@ def place_of(noise: Noise, mask: int) -> int:
         if noise.sets[k] == mask:
             noise.newest = k
             return k
-    noise.newest, noise.repeats = 1 - noise.newest, False
+    noise.newest = 1 - noise.newest
+    noise.repeats = False
     noise.sets[noise.newest] = mask
     return noise.newest
 
@@ -317,7 +319,8 @@ def update_degrees(noise: Noise, n: int, mask: int) -> None:
     Gyros of a kind have tails of a kind: x is the mean of all, or of a channel by
     itself if that is more for certain.
     """
-    total, count = 0.0, 0
+    total = 0.0
+    count = 0
     for i in range(n):
         if mask >> i & 1:
             total += noise.neighbours[i] / (noise.square[i] * noise.square[i]) - 1.0
@@ -362,7 +365,8 @@ def update_slow_level(
 ) -> None:
     """Follow the level of one longer time by the difference of two statistics."""
     if learn:
-        level, square = noise.now.level[k, i], 0.5 * step * step * noise.longest[i]
+        level = noise.now.level[k, i]
+        square = 0.5 * step * step * noise.longest[i]
         noise.now.level[k, i] += gain * (
             min(square, THREE_SIGMA * max(level, 1.0)) - level
         )
@@ -373,10 +377,8 @@ def update_long_noise(
     noise: Noise, scale: int, n: int, mask: int, t: Array, learn: bool
 ) -> None:
     """Take the statistics t (n,) of a longer time into its level over blocks."""
-    quarter, gain = (
-        int(noise.seen[QUARTER]) % 4,
-        1.0 / min(noise.seen[scale] + 3.0, 80.0),
-    )
+    quarter = int(noise.seen[QUARTER]) % 4
+    gain = 1.0 / min(noise.seen[scale] + 3.0, 80.0)
     for i in range(n):
         if mask >> i & 1:
             if scale == QUARTER:
@@ -413,7 +415,8 @@ def update_long_noise(
 def update_largest_rate(noise: Noise, square: float) -> None:
     """Begin to learn the slow noise of motion anew where the square of the rate is far beyond any before."""
     if noise.regime == MOTION and square > FASTER * noise.met:
-        noise.met, noise.lived[MOTION] = square, 0.0
+        noise.met = square
+        noise.lived[MOTION] = 0.0
 
 
 @compiled
@@ -423,7 +426,8 @@ def follow_loudness(noise: Noise, n: int, louder: float, seconds: float) -> None
         noise.since[i] += seconds
         variance = noise.now.sample[i] * max(1.0, BURST * noise.quick[i])
         if variance > louder * noise.loudest[i]:
-            noise.loudest[i], noise.since[i] = variance, 0.0
+            noise.loudest[i] = variance
+            noise.since[i] = 0.0
 
 
 @compiled

@@ -43,7 +43,8 @@ CLOSER = (
 def find_outliers(params: Constants, kf: Estimator, values: Array) -> None:
     """Find the outliers of a sample, and correct the sample without possible spikes."""
     kf.outliers = kf.spiked = 0
-    burst, farthest = 1.0, 0.0
+    burst = 1.0
+    farthest = 0.0
     for i in range(params.sensors.n):
         kf.imputed[i] = kf.corrected[i]
         burst = max(burst, excess_of(kf, i))
@@ -124,7 +125,8 @@ def fill_sample_covariance(params: Constants, kf: Estimator) -> None:
 @compiled
 def chi_without(params: Constants, kf: Estimator, without: int) -> float:
     """Return the chi-square of the sample without some channels; ``kf.clean_rate`` gets the rate of the others."""
-    n, parity = params.sensors.n, kf.clean
+    n = params.sensors.n
+    parity = kf.clean
     mask = kf.mask & ~without
     fill_joint_parity(parity, params.sensors, mask, kf.matrix, UNKNOWN_RATE)
     apply_gain(parity.gain, n, kf.corrected, kf.clean_rate)
@@ -150,7 +152,8 @@ def change_without(
     """
     if not params.determines[kf.mask & ~without]:
         return -1.0
-    chi, free = chi_without(params, kf, without), -3.0
+    chi = chi_without(params, kf, without)
+    free = -3.0
     for i in range(params.sensors.n):
         free += (kf.mask & ~without) >> i & 1
     if chi > burst * usual_chi(free) + limit:
@@ -181,7 +184,8 @@ def choose(
             if change >= 0.0:
                 next_channel = min(next_channel, max(change, of_channel))
                 if change < of_channel:
-                    of_channel, channel = change, 1 << i
+                    of_channel = change
+                    channel = 1 << i
     unit = 0
     of_unit = next_unit = math.inf
     for u in range(params.units):
@@ -190,7 +194,8 @@ def choose(
         if change >= 0.0:
             next_unit = min(next_unit, max(change, of_unit))
             if change < of_unit:
-                of_unit, unit = change, inside
+                of_unit = change
+                unit = inside
     if CLOSER * of_channel <= of_unit or (unit == 0 and channel):
         return channel if decides(kf, of_channel, next_channel) else candidates
     return unit if decides(kf, of_unit, next_unit) else kf.mask
@@ -207,15 +212,18 @@ def remove_farthest(params: Constants, kf: Estimator, burst: float) -> int:
     """Return channels of several units: remove the farthest until the rest is noise."""
     without = 0
     for _ in range(params.sensors.n):
-        chi, free = chi_without(params, kf, without), -3.0
-        farthest, most = -1, 0.0
+        chi = chi_without(params, kf, without)
+        free = -3.0
+        farthest = -1
+        most = 0.0
         for i in range(params.sensors.n):
             information = kf.clean.information[i, i]
             if (kf.mask & ~without) >> i & 1 and information > 0.0:
                 free += 1.0
                 size = kf.clean_values[i] * kf.clean_values[i] / information
                 if size > most:
-                    farthest, most = i, size
+                    farthest = i
+                    most = size
         if chi <= burst * usual_chi(free) or farthest < 0:
             break
         if not params.spans[kf.mask & ~without & ~(1 << farthest)]:
@@ -233,7 +241,8 @@ def leave_spike_out(
     if not params.determines[kf.mask & ~kf.spiked]:
         kf.spiked = kf.mask
         return
-    chi, free = chi_without(params, kf, kf.spiked), -3.0
+    chi = chi_without(params, kf, kf.spiked)
+    free = -3.0
     for i in range(params.sensors.n):
         free += (kf.mask & ~kf.spiked) >> i & 1
     kf.odd = max(1.0, chi / burst / usual_chi(free))

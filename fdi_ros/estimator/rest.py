@@ -70,7 +70,8 @@ def update_rest(params: Constants, kf: Estimator) -> None:
     for a in range(3):
         variance = known = 0.0
         for i in range(n):
-            gain, part = kf.fused.gain[a, i], 0.0
+            gain = kf.fused.gain[a, i]
+            part = 0.0
             if gain != 0.0:
                 variance += gain * gain * kf.noise.now.block[i] / params.length
                 for j in range(n):

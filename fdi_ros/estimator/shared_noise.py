@@ -99,7 +99,9 @@ def update_shared(params: Constants, kf: Estimator) -> None:
 @compiled
 def update_covariance(params: Constants, kf: Estimator) -> None:
     """Take the innovations about their half-second mean into R. Absent channels keep their rows."""
-    shared, n, largest = kf.shared, params.sensors.n, 0.0
+    shared = kf.shared
+    n = params.sensors.n
+    largest = 0.0
     for i in range(n):
         largest = max(largest, abs(kf.statistic[i]))
     half = params.length / params.adaptation_gain
@@ -123,7 +125,8 @@ def add_fourth_difference(params: Constants, kf: Estimator) -> None:
 
     In white noise its standard deviation is sqrt(70) times the one of the values.
     """
-    shared, n = kf.shared, params.sensors.n
+    shared = kf.shared
+    n = params.sensors.n
     past = shared.past
     for i in range(n):
         shared.difference[i] = 0.0
@@ -154,7 +157,9 @@ def update_shape(params: Constants, kf: Estimator) -> None:
     What was measured of others before stands: missing channels make no noise smaller.
     At rest, and in motion, R begins anew with the variances of that time.
     """
-    shared, n, noise = kf.shared, params.sensors.n, kf.noise
+    shared = kf.shared
+    n = params.sensors.n
+    noise = kf.noise
     kept = kf.mask & ~kf.excluded_from_rate & ~kf.beyond
     if not params.spans[kept]:
         kept = kf.mask
@@ -163,13 +168,12 @@ def update_shape(params: Constants, kf: Estimator) -> None:
     fill_parity(shared.alone, params.sensors, kept, noise.now.sample)
     if kept != shared.kept:
         # Differences are of samples of the same channels.
-        shared.kept, shared.fresh = kept, 0
+        shared.kept = kept
+        shared.fresh = 0
         fill_parity(shared.even, params.sensors, kept, shared.ones)
     if noise.regime != shared.regime:
-        shared.regime, shared.count = (
-            noise.regime,
-            0.5 * params.length / params.adaptation_gain,
-        )
+        shared.regime = noise.regime
+        shared.count = 0.5 * params.length / params.adaptation_gain
         for i in range(n):
             shared.local[i] = 0.0
             for j in range(n):
@@ -179,7 +183,9 @@ def update_shape(params: Constants, kf: Estimator) -> None:
 @compiled
 def update_shared_level(params: Constants, kf: Estimator) -> None:
     """Find the variance of each channel now, with noise that independent channels do not explain; once a block."""
-    shared, n, noise = kf.shared, params.sensors.n, kf.noise
+    shared = kf.shared
+    n = params.sensors.n
+    noise = kf.noise
     checks = number_in(shared.kept, n) - 3.0
     shared.coherent = update_coherence(params, kf)
     update_vibration(params, kf)
@@ -227,7 +233,8 @@ def follow_checked(shared: SharedNoise, regime: int, i: int, level: float) -> No
 @compiled
 def update_line(params: Constants, kf: Estimator) -> None:
     """Remember what of R is a line, while nothing is suspicious: the onset of a fault is in R for a second."""
-    shared, adaptation_gain = kf.shared, params.adaptation_gain / MEMORY
+    shared = kf.shared
+    adaptation_gain = params.adaptation_gain / MEMORY
     for i in range(params.sensors.n):
         for j in range(params.sensors.n):
             now = shared.coherent * shared.outer[max(i, j), min(i, j)]
@@ -237,7 +244,10 @@ def update_line(params: Constants, kf: Estimator) -> None:
 @compiled
 def update_dimensions(params: Constants, kf: Estimator, k: float) -> float:
     """Find the level of R over the variances; return the share of R that is a line, by its dimensions."""
-    shared, n, first, second = kf.shared, params.sensors.n, 0.0, 0.0
+    shared = kf.shared
+    n = params.sensors.n
+    first = 0.0
+    second = 0.0
     product = shared.product
     for i in range(n):
         for j in range(i):
@@ -258,11 +268,11 @@ def update_dimensions(params: Constants, kf: Estimator, k: float) -> float:
 @compiled
 def update_coherence(params: Constants, kf: Estimator) -> float:
     """Average the products of a block, correct each variance by them; return the coherent share."""
-    shared, n, noise = kf.shared, params.sensors.n, kf.noise
-    adaptation_gain, count = (
-        params.adaptation_gain / MEMORY if shared.taken else 0.0,
-        max(shared.taken, 1),
-    )
+    shared = kf.shared
+    n = params.sensors.n
+    noise = kf.noise
+    adaptation_gain = params.adaptation_gain / MEMORY if shared.taken else 0.0
+    count = max(shared.taken, 1)
     steady = update_common(shared, adaptation_gain, count) < STEADY
     explained = total = 0.0
     for i in range(n):
@@ -320,9 +330,11 @@ def update_common(shared: SharedNoise, adaptation_gain: float, count: int) -> fl
 @compiled
 def update_vibration(params: Constants, kf: Estimator) -> None:
     """Find the mean square of the vibration of the body about each axis: what of the rate is too quick for motion."""
-    shared, length = kf.shared, float(params.length)
+    shared = kf.shared
+    length = float(params.length)
     for a in range(3):
-        noise, within = shared.alone.inverse[a, a], 0.0
+        noise = shared.alone.inverse[a, a]
+        within = 0.0
         if length > 2.0 and kf.blocks > 0:
             # About a line through the samples of the block.
             slope = kf.rates[0, a] - kf.rates[1, a]

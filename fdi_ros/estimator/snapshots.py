@@ -48,7 +48,8 @@ def keep_snapshot(params: Constants, kf: Estimator) -> None:
 def pass_hole(params: Constants, kf: Estimator, seconds: float) -> None:
     """Widen the biases after a hole, in the snapshots too, which the biases after the hole are compared with."""
     if not is_after_hole(params, kf):
-        kf.hole_at, kf.hole_sample = kf.seconds - seconds, kf.samples
+        kf.hole_at = kf.seconds - seconds
+        kf.hole_sample = kf.samples
     move_biases(params, kf, UNWATCHED * math.sqrt(min(seconds, LONG_HOLE)), 0.0)
 
 
@@ -100,12 +101,14 @@ def predict_from(
     params: Constants, kf: Estimator, seconds: float, states: ErrorStates
 ) -> bool:
     """Predict the present states from the last snapshot before a time, s; return whether one exists."""
-    best, latest = -1, 0.0
+    best = -1
+    latest = 0.0
     for tier in range(TIERS):
         for k in range(min(kf.taken[tier], SNAPSHOTS)):
             snapshot = kf.snapshots[tier * SNAPSHOTS + k]
             if snapshot.seconds <= seconds and (best < 0 or snapshot.seconds > latest):
-                best, latest = tier * SNAPSHOTS + k, snapshot.seconds
+                best = tier * SNAPSHOTS + k
+                latest = snapshot.seconds
     if best < 0:
         return False
     snapshot = kf.snapshots[best]

@@ -435,7 +435,8 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
         else []
     )
     if (noise := report.force_noise) is not None and np.isfinite(noise.quiet).any():
-        low, high = np.nanmin(noise.quiet), np.nanmax(noise.quiet)
+        low = np.nanmin(noise.quiet)
+        high = np.nanmax(noise.quiet)
         words.append(
             f"{report.channels} accelerometers, noise {low:.2g} to {high:.2g} {FORCE.unit}"
         )

@@ -435,7 +435,8 @@ def _throttle(summary: Summary) -> dict[str, list[float]] | None:
 
 def _mode_shapes(summary: Summary) -> list[dict[str, Any]]:
     """Return the flight modes as labelled shades."""
-    origin, scores = summary.stream.origin_ns or 0, summary.scores
+    origin = summary.stream.origin_ns or 0
+    scores = summary.scores
     modes = summary.context.modes
     begins = [(one.stamp - origin) * 1e-9 for one in modes]
     ends = [*begins, scores.end_s][1:]

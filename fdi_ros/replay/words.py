@@ -394,7 +394,8 @@ def _folded(story: Story) -> tuple[list[Episode], list[str]]:
     for why, some in alike.items():
         channels = sorted({name for one in some for name in one.channels})
         who = first_of(short_names(channels), MOST_TOLD)
-        begin, end = some[0].start_s, max(one.end_s for one in some)
+        begin = some[0].start_s
+        end = max(one.end_s for one in some)
         words.append(
             f"{len(some)} times between {begin:.1f} and {end:.1f} s STALE: {who} ({why})"
         )
