@@ -6,6 +6,7 @@
 const DASHES = { dash: "7 4", dot: "2 3", dashdot: "8 3 2 3" };
 const GLYPHS = { detected: "M-5,-9h10l-5,8z", isolated: "M0,2l5,5l-5,5l-5,-5z", declared: "M-4,-9l8,8M4,-9l-8,8", autopilot: "M-3,-7h6v6h-6z" };
 const LETTER = 6.6; // px, about, of the small print
+const BUTTONS = 96; // px, width of the buttons that save a plot, at its upper right
 
 const esc = (text) => String(text).replace(/[&<>"']/g, (c) => `&#${c.charCodeAt(0)};`);
 const px = (value) => value.toFixed(1);
@@ -220,10 +221,11 @@ class Chart {
   head(left, right) {
     const far = this.cut && (this.cut[0] < this.y.range[0] || this.cut[1] > this.y.range[1]);
     const note = far ? `all: ${short(this.cut[0])} to ${short(this.cut[1])}` : "";
-    const room = Math.floor((right - 4) / LETTER) - (note ? note.length + 2 : 0);
+    const end = right - BUTTONS;
+    const room = Math.floor((end - 4) / LETTER) - (note ? note.length + 2 : 0);
     const title = this.title.length > room ? `${this.title.slice(0, Math.max(room - 1, 8))}…` : this.title;
     return `<text class="name" x="4" y="12">${esc(title)}</text>`
-      + (note ? `<text class="cut" x="${px(right)}" y="12" text-anchor="end">${esc(note)}</text>` : "");
+      + (note ? `<text class="cut" x="${px(end)}" y="12" text-anchor="end">${esc(note)}</text>` : "");
   }
 
   point(value) { // the cursor of this plot and of those linked to it
