@@ -208,6 +208,9 @@ VERBS = {
         {
             "bag": {},
             "--output --write": takes_path("write the config to this file"),
+            "--urdf": takes_path(
+                "take the mounts of the units from this URDF, by the frame_id of their messages"
+            ),
             **RESULTS,
             "--degrees": {},
         },

@@ -18,7 +18,7 @@ from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.errors import ConfigError
 from fdi_ros.inspection.findings import findings_figures, verdict_of
 from fdi_ros.inspection.fitness import candidates, needs, recording_findings
-from fdi_ros.inspection.starting_config import starting_config
+from fdi_ros.inspection.starting_config import StartingConfig, starting_config
 from fdi_ros.inspection.topics import (
     TopicReport,
     inspect,
@@ -26,6 +26,7 @@ from fdi_ros.inspection.topics import (
     recording_text,
     topics_text,
 )
+from fdi_ros.inspection.urdf import Urdf
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.report.layout import unit_of
 from fdi_ros.system.files import whole
@@ -37,16 +38,25 @@ if TYPE_CHECKING:
 
 def run_inspect(arguments: Namespace) -> int:
     """Print the fitness of a recording and its topics and write a config to start from."""
-    outputs = Outputs(arguments, ("json", "output"), [arguments.bag])
+    inputs = [path for path in (arguments.bag, arguments.urdf) if path is not None]
+    outputs = Outputs(arguments, ("json", "output"), inputs)
     unit = unit_of(arguments.degrees)
+    urdf = None if arguments.urdf is None else Urdf(arguments.urdf)
     reports, damage = inspect(arguments.bag)
-    config, refused = _starting_config(reports, arguments.bag)
+    start, refused = _starting_config(reports, arguments.bag, urdf)
+    config = None if start is None else start.text
     found = verdict_of(recording_findings(reports, refused, unit))
     text = f"{found.words}\n{recording_text(reports, arguments.bag)}"
     text += topics_text(reports, damage, unit)
+    if start is not None and start.mounted:
+        text += f"\nmounts of the config: {start.mounted}\n"
     if config is not None and arguments.output is None:
-        bag = shlex.quote(shown(arguments.bag))
-        text += f"\na config to start from: fdi inspect {bag} --output my_gyros.yaml\n"
+        words = shlex.quote(shown(arguments.bag))
+        if urdf is not None:
+            words += f" --urdf {shlex.quote(shown(arguments.urdf))}"
+        text += (
+            f"\na config to start from: fdi inspect {words} --output my_gyros.yaml\n"
+        )
     figures = recording_figures(reports, arguments.bag, damage)
     figures |= {
         **findings_figures(list(recording_findings(reports, refused))),
@@ -67,21 +77,21 @@ def run_inspect(arguments: Namespace) -> int:
 
 
 def _starting_config(
-    reports: Sequence[TopicReport], bag: Path
-) -> tuple[str | None, str]:
+    reports: Sequence[TopicReport], bag: Path, urdf: Urdf | None
+) -> tuple[StartingConfig | None, str]:
     """Return a config to start from, and why the node would refuse it.
 
     The config is None if the recording is unfit or the node would refuse it.
     """
     if needs(reports):
         return None, ""
-    start = starting_config(candidates(reports), bag)
+    start = starting_config(candidates(reports), bag, urdf)
     try:
         Config.from_parameters(start.parameters)
     except ConfigError as error:
         # A recording may contain any values. A config that the node refuses is no use.
         return None, f"other values: {shown(error, LINE)}"
-    return start.text, ""
+    return start, ""
 
 
 def run_setup(arguments: Namespace) -> int:

@@ -24,7 +24,7 @@ from fdi_ros.config.config import (
 )
 from fdi_ros.core.alignment import MAX_BRIDGE
 from fdi_ros.core.sources import input_of
-from fdi_ros.errors import BagError
+from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.inspection.fitness import candidates, left_out, needs, one_clock
 from fdi_ros.inspection.names import unit_names
 from fdi_ros.inspection.topics import (
@@ -41,7 +41,9 @@ from fdi_ros.inspection.turns import (
     angle_of,
     find_turn,
 )
-from fdi_ros.system.text import shown
+from fdi_ros.inspection.urdf import Urdf
+from fdi_ros.model.samples import Array
+from fdi_ros.system.text import listed, shown
 
 #: topics of flight logs, which keep the numbers of the autopilot
 _LOG_TOPIC = re.compile(r"/imu_[0-9]{1,3}")
@@ -65,13 +67,16 @@ class StartingConfig:
     remarks: dict[str, str]
     #: warnings before the settings are used, empty if none
     look: str = ""
+    #: source of the mounts, empty: none, identity is assumed
+    mounted: str = ""
     #: topics with gyros left out, and why
     unused: tuple[tuple[str, str], ...] = ()
 
     @property
     def text(self) -> str:
         """The parameter file."""
-        origin = f"made by fdi inspect from {self.bag}, to start from. Noise and rates are measured, mounts are not."
+        mounts = "mounts are from a URDF" if self.mounted else "mounts are not"
+        origin = f"made by fdi inspect from {self.bag}, to start from. Noise and rates are measured, {mounts}."
         return parameter_file(self.parameters, origin, self.remarks)
 
 
@@ -166,8 +171,35 @@ def _turned_units(path: Path, config: Config) -> str:
     return ", ".join(turned)
 
 
-def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
-    """Make a config to start from, of the topics of gyros in a recording."""
+def _mounts_of(urdf: Urdf, chosen: Sequence[TopicReport]) -> tuple[Array, str]:
+    """Return the mounts (n, 3, 3) of n units from a URDF, and words for their source."""
+    frames = []
+    for report in chosen:
+        if report.frame_changes or not report.frame:
+            fault = (
+                "change their frame_id" if report.frame_changes else "have no frame_id"
+            )
+            raise ConfigError(
+                f"no mounts from {urdf.name}: messages on {shown(report.topic.name)} {fault}"
+            )
+        frames.append(report.frame)
+    names = unit_names([report.topic.name for report in chosen])
+    units = [
+        f"{name} is link {shown(frame)}"
+        for name, frame in zip(names, frames, strict=True)
+    ]
+    words = f"those of the URDF {urdf.name} ({listed(units)}; the body frame is that of {names[0]})"
+    return urdf.mounts(frames), words
+
+
+def starting_config(
+    chosen: Sequence[TopicReport], bag: Path, urdf: Urdf | None = None
+) -> StartingConfig:
+    """Make a config to start from, of the topics of gyros in a recording.
+
+    ``urdf``: gives the mounts of the units by the frames of their messages. `ConfigError`
+    if it does not.
+    """
     kind = chosen[0].kind
     assert kind is not None
     rate = max(report.rate for report in chosen)
@@ -199,6 +231,7 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
         ),
     }
     topics = [report.topic.name for report in chosen]
+    mounted = ""
     if kind.stamped:
         words = (
             "identity, NOT MEASURED: `fdi setup` finds how the units are turned against each other, from turns about"
@@ -208,7 +241,11 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
         of_a_log = all(_LOG_TOPIC.fullmatch(topic) for topic in topics)
         known["imus.topics"] = topics, ""
         known["imus.names"] = unit_names(topics), "by the topics above"
-        known["imus.mounts"] = np.tile(np.eye(3).ravel(), len(chosen)).tolist(), words
+        mounts = np.tile(np.eye(3), (len(chosen), 1, 1))
+        if urdf is not None:
+            mounts, mounted = _mounts_of(urdf, chosen)
+            words = mounted
+        known["imus.mounts"] = mounts.ravel().tolist(), words
         known["imus.max_skew"] = _rounded_up(0.2 / rate), ""
         if of_a_log:
             words = "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
@@ -219,6 +256,10 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
             words = f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s {none}"
             known["imus.timeout"] = timeout, words
     else:
+        if urdf is not None:
+            raise ConfigError(
+                f"no mounts from {urdf.name}: {shown(topics[0])} is an array of channels, which have no frame each"
+            )
         words = (
             "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns about all axes,"
             " but for those of three reference channels: these must be right"
@@ -233,6 +274,7 @@ def starting_config(chosen: Sequence[TopicReport], bag: Path) -> StartingConfig:
         shown(bag.name),
         parameters,
         {name: words for name, (_, words) in known.items() if words},
+        mounted=mounted,
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
 from fdi_ros.core.copies import copies_among
+from fdi_ros.core.messages import ENCAPSULATION, frame_of
 from fdi_ros.core.sources import Source, source_of_type
 from fdi_ros.inspection.repeats import Repeats
 from fdi_ros.inspection.segments import Noise, NoiseSegments
@@ -30,6 +31,7 @@ from fdi_ros.report.layout import (
     table,
     told,
 )
+from fdi_ros.system.files import NAME
 from fdi_ros.system.text import date_of, shown
 
 #: intervals longer than this many usual ones are gaps
@@ -84,6 +86,10 @@ class TopicReport:
     stamp_steps: list[Array] = field(default_factory=list)
     #: first and last stamp, ns, or None
     stamps: tuple[int, int] | None = None
+    #: frame_id of the first well-formed message with a stamp, None before
+    frame: str | None = None
+    #: whether a later message has another one
+    frame_changes: bool = False
     #: topic of the same sensor: the same values to rounding, turned, scaled or some
     #: messages apart
     copy_of: str = ""
@@ -214,6 +220,7 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     force = decoded.values[good, report.channels :]
     times = times[good]
     if kind.stamped:
+        _take_frames(report, batch, rows[good])
         _take_stamps(report, stamp)
         if math.isnan(report.ahead) and len(stamp):
             report.ahead = float(np.median((stamp - times) * 1e-9))
@@ -276,6 +283,19 @@ def _settle(report: TopicReport) -> None:
     report.interval = usual_interval(steps)
     if report.interval > 0:
         report.gaps = int((steps > GAP * report.interval).sum())
+
+
+def _take_frames(report: TopicReport, batch: Batch, rows: Int) -> None:
+    """Take the frame_id of further well-formed messages."""
+    if not len(rows):
+        return
+    frame = frame_of(batch.message(int(rows[0])))
+    # A frame is followed by doubles of more than NAME bytes, so each message is this long.
+    size = min(len(frame.encode()) + 1, NAME)
+    begin = batch.offset[rows] + ENCAPSULATION + 12
+    frames = batch.buffer[begin[:, np.newaxis] + np.arange(size)]
+    report.frame = frame if report.frame is None else report.frame
+    report.frame_changes |= frame != report.frame or bool((frames != frames[0]).any())
 
 
 def _take_stamps(report: TopicReport, stamp: Int) -> None:

@@ -83,6 +83,8 @@ CSV_COLUMNS = 4096
 STEPS, STEPS_PER_BYTE = 10_000_000, 20
 """SQLite steps that any query may take, plus this number per byte of the file."""
 
+#: of the description of a robot
+URDF_BYTES = 1 << 22
 YAML_BYTES = 1 << 20
 #: values of a YAML file, those behind aliases counted each time
 YAML_NODES = 50_000
