@@ -200,7 +200,9 @@ class Autopilot:
                 number, -((self.boot - now) // step) * step + self.boot
             )
             if now >= due:
-                self.due[number] = max(due + interval * 1000, now - interval * 1000)
+                # After a pause too, messages of one interval have the same times.
+                passed = max(1, (now - due) // (interval * 1000))
+                self.due[number] = due + passed * interval * 1000
                 self._imu(number, now, out)
         return out
 
