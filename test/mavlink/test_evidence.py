@@ -200,6 +200,32 @@ def test_a_set_within_one_of_three_is_blamed_while_the_others_are_trusted() -> N
     assert watched.blamed(1.0) == {2}
 
 
+@pytest.mark.parametrize(
+    ("size", "seconds", "is_blamed"),
+    [(0.08, 1.0, True), (0.08, 0.3, False), (0.05, 3.0, False)],
+)
+def test_a_set_of_several_imus_names_the_odd_one_by_its_size_and_time(
+    size: float, seconds: float, is_blamed: bool
+) -> None:
+    """One of three axes is wrong, and two of them agree: from 0.06 rad/s on it is the third."""
+    watched = Watched()
+    watched.rate = lambda t: 0.1 * np.array([math.sin(2.1 * t), math.cos(t), 0.5])
+    watched.gyros[2] = biased(size)
+    watched.states[::3] = [AMBIGUOUS] * 3
+    assert watched.blamed(seconds) == ({2} if is_blamed else set())
+
+
+def test_a_set_of_several_imus_without_an_odd_one_names_nobody() -> None:
+    watched = Watched()
+    watched.gyros[1:] = [biased(-0.1), biased(0.1)]
+    watched.states[::3] = [AMBIGUOUS] * 3
+    assert not watched.blamed(3.0)
+    watched = Watched()
+    watched.gyros[2] = biased(0.1)
+    watched.states[1::3] = [AMBIGUOUS] * 3
+    assert not watched.blamed(3.0), "a set of another axis"
+
+
 # What is no steady error ------------------------------------------------------------------
 
 
