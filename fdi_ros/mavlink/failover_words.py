@@ -38,9 +38,13 @@ WORDS = {
 
 
 def imu_name(imu: int, channels: Sequence[str]) -> str:
-    """Return the autopilot's name of an IMU, from 0, and its topic's: IMU 1 (imu_0)."""
+    """Return the autopilot's name of an IMU, from 0, and the topic's: IMU 1 (front).
+
+    Without the topic's name if that only repeats the number: imu_1.
+    """
     name = channels[3 * imu].rpartition(".")[0]
-    return f"IMU {imu + 1} ({name})" if name else f"IMU {imu + 1}"
+    repeats = name in ("", f"imu_{imu + 1}")
+    return f"IMU {imu + 1}" if repeats else f"IMU {imu + 1} ({name})"
 
 
 def imu_text(

@@ -17,7 +17,7 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink import failover_file
 from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
 from fdi_ros.mavlink.failover_policy import Condition, PolicySettings
-from fdi_ros.mavlink.failover_words import WORDS
+from fdi_ros.mavlink.failover_words import WORDS, imu_name, imu_text
 from fdi_ros.system.clocks import Clocks
 from mavlink.autopilots import (
     NS,
@@ -155,14 +155,14 @@ def test_a_bad_imu_is_out_soon_and_back_two_seconds_after_it_agrees(
     assert autopilot.sets[0] == (pytest.approx(at, abs=300 * MS), "INS_USE", 0.0)
     assert {order[1:] for order in autopilot.sets} == {("INS_USE", 0.0)}
     assert autopilot.flies_with == 1
-    assert flying.texts[-1].startswith("IMU 1 (imu_1) out of use (gyro y +0.3")
+    assert flying.texts[-1].startswith("IMU 1 out of use (gyro y +0.3")
     assert kept(flying, tmp_path) == (1, [1])
     # The monitor still names it: in flight its raw values decide, as it costs an EKF lane.
     flying.fault(1, 0.0, seconds=1.5)
     assert flying.in_use == [False, True, True]
     flying.run(1.5)
     assert flying.in_use == [True, True, True]
-    assert flying.run(4.0).texts[-1] == "IMU 1 (imu_1) in use, no fault"
+    assert flying.run(4.0).texts[-1] == "IMU 1 in use, no fault"
     assert kept(flying, tmp_path, ()) == (1, [])
 
 
@@ -191,7 +191,7 @@ def test_two_bad_imus_are_both_out_and_the_last_one_stays(flying: Monitored) -> 
     assert not any("lane" in text or "differs" in text for text in flying.texts)
     flying.fault(1, 0.5, seconds=2.0)
     assert flying.in_use == [True, False, False]
-    assert flying.texts[-1] == "IMU 1 (imu_1) faulty AND IN USE: land"
+    assert flying.texts[-1] == "IMU 1 faulty AND IN USE: land"
     flying.heal(1, 1.0)
     flying.heal(3, 5.0)
     assert flying.in_use == [True, False, True]
@@ -206,7 +206,7 @@ def test_with_a_limit_a_worse_imu_is_announced_and_stays(tmp_path: Path) -> None
     flying.fault(2, 0.3, seconds=4.0)
     flying.fault(3, 1.0, seconds=4.0)
     assert flying.in_use == [True, False, True]
-    assert "IMU 3 (imu_3) faulty AND IN USE: land" in flying.texts
+    assert "IMU 3 faulty AND IN USE: land" in flying.texts
 
 
 @pytest.mark.parametrize("size", [0.0, 0.02])
@@ -225,7 +225,7 @@ def test_a_raw_difference_without_the_monitor_does_nothing(
     flying.fault(1, 0.2, (OK, state, OK), seconds=4.0)
     assert not flying.autopilots[0].sets
     flying.run(3.0)
-    assert "IMU 1 (imu_1) differs from the others" in flying.texts
+    assert "IMU 1 differs from the others" in flying.texts
 
 
 def test_a_set_within_one_imu_names_it_after_300_ms(flying: Monitored) -> None:
@@ -271,7 +271,7 @@ def test_a_clear_error_while_the_others_differ_names_nobody(flying: Monitored) -
 def test_no_fault_is_not_said_of_an_imu_that_differs(flying: Monitored) -> None:
     """IMU 2 is the odd one for long, then nobody is, then it is again."""
     flying.fault(2, 0.2, [UNCHECKED] * 3, seconds=7.0)
-    assert flying.texts[-1] == "IMU 2 (imu_2) differs from the others"
+    assert flying.texts[-1] == "IMU 2 differs from the others"
     flying.fault(1, 0.6, [UNCHECKED] * 3)
     flying.states[6:] = [UNCHECKED] * 3
     flying.run(10.0)
@@ -279,7 +279,7 @@ def test_no_fault_is_not_said_of_an_imu_that_differs(flying: Monitored) -> None:
     flying.fault(1, 0.0, [UNCHECKED] * 3, seconds=4.0)
     assert not any("no fault" in text for text in flying.texts)
     flying.heal(2, 2.0)
-    assert "IMU 2 (imu_2) in use, no fault" in flying.texts
+    assert "IMU 2 in use, no fault" in flying.texts
 
 
 def shaken(imus: Sequence[int], frequency: float, amplitude: float) -> Motion:
@@ -394,7 +394,7 @@ def test_a_danger_that_cannot_be_answered_is_repeated(flying: Monitored) -> None
     autopilot.read_only.add("INS_USE")
     flying.fault(1, 0.5, seconds=25.0)
     told = [text for text in flying.texts if DANGER in text]
-    assert told == ["IMU 1 (imu_1) faulty AND IN USE: land"] * 3
+    assert told == ["IMU 1 faulty AND IN USE: land"] * 3
     assert {text for severity, text in autopilot.texts if severity < 4}
 
 
@@ -434,8 +434,8 @@ def test_an_imu_that_somebody_else_has_set_is_left_alone(
     flying.run(3.0)
     assert autopilot.sets[count:] == []
     assert flying.in_use[0]
-    assert flying.texts[-1] == "IMU 1 (imu_1) faulty AND IN USE: land"
-    assert "IMU 1 (imu_1) set by others, left alone" in flying.heal(1, 2.0).texts
+    assert flying.texts[-1] == "IMU 1 faulty AND IN USE: land"
+    assert "IMU 1 set by others, left alone" in flying.heal(1, 2.0).texts
 
 
 def test_one_lane_left_is_announced_and_a_short_hit_is_none(flying: Monitored) -> None:
@@ -482,7 +482,7 @@ def test_a_gyro_that_is_still_faulty_stays_out_and_is_announced(
     autopilot.armed = False
     flying.run(10.0)
     assert flying.in_use == [True, False, True]
-    assert flying.texts[-1] == "IMU 2 (imu_2) still faulty, stays out of use"
+    assert flying.texts[-1] == "IMU 2 still faulty, stays out of use"
     assert "out of use: IMU 2" in flying.failover.status(flying.now)[1]
     autopilot.armed = True
     flying.fault(2, 0.5, seconds=5.0)
@@ -561,7 +561,7 @@ def test_a_new_start_of_the_node_needs_no_right_unix_time(
 
 def test_an_operator_puts_back(flying: Monitored) -> None:
     flying.fault(1, 0.3, seconds=1.0)
-    assert flying.failover.restore(flying.now) == (True, "IMU 1 (imu_1) is put back")
+    assert flying.failover.restore(flying.now) == (True, "IMU 1 is put back")
     flying.run(5.0)
     assert flying.in_use == [True] * 3
     answer = flying.failover.restore(flying.now)
@@ -656,6 +656,24 @@ def test_no_two_conditions_have_the_same_words_and_each_fits() -> None:
     assert max(len(f"FDI: IMU 1 {text}") for text in texts) <= 50
 
 
+@pytest.mark.parametrize(
+    ("unit", "name"),
+    [
+        ("imu_2", "IMU 2"),
+        ("imu_1", "IMU 2 (imu_1)"),
+        ("front", "IMU 2 (front)"),
+        ("", "IMU 2"),
+    ],
+)
+def test_a_unit_is_named_where_its_name_is_more_than_the_number(
+    unit: str, name: str
+) -> None:
+    channels = [f"{unit}.{axis}" if unit else axis for axis in "xyz"]
+    assert imu_name(1, ["a.x", "a.y", "a.z", *channels]) == name
+    text = imu_text(1, Condition.OUT, ["a.x", "a.y", "a.z", *channels])
+    assert text == f"FDI: {name} out of use"
+
+
 def test_a_size_is_given_when_it_is_known(flying: Monitored) -> None:
     """Noise of 60 mrad/s: 0.1 rad/s of it is not known to five standard deviations."""
     random = np.random.default_rng(1)
@@ -663,7 +681,7 @@ def test_a_size_is_given_when_it_is_known(flying: Monitored) -> None:
     flying.run(1.0)
     flying.fault(1, 0.12, seconds=2.0)
     out = [text for text in flying.texts if "out of use" in text]
-    assert out in ([], ["IMU 1 (imu_1) out of use"])
+    assert out in ([], ["IMU 1 out of use"])
 
 
 def test_a_file_that_cannot_be_written_in_flight_is_announced_and_written_later(
@@ -709,7 +727,7 @@ def test_a_trade_needs_a_reserve(tmp_path: Path) -> None:
     assert [value for _, _, value in autopilot.sets][-1] == 0.0
     assert not autopilot.parameters["INS_USE2"]
     assert autopilot.parameters["INS_USE"]
-    assert "IMU 1 (imu_1) faulty AND IN USE: land" in talk.texts
+    assert "IMU 1 faulty AND IN USE: land" in talk.texts
 
 
 def test_an_imu_without_samples_is_no_hindrance(flying: Monitored) -> None:
