@@ -503,21 +503,16 @@ class Sequential(Detector):
                 "louder": louder,
             },
         )
-        params = self.constants[0]
         n = geometry.n
         noise = self.noise
-        unit = np.zeros(n, dtype=np.int64)
-        for u, channels in enumerate(geometry.units):
-            unit[list(channels)] = u
-        params["units"] = len(geometry.units)
-        params["unit"][:n] = unit
-        params["members"][: len(geometry.units)] = [
-            mask_of(channels) for channels in geometry.units
-        ]
+        self._fill_units()
+        self._fill_times()
+        self._fill_sets()
+        params = self.constants[0]
         prepare_layout(
             params["layout"],
             geometry.axes,
-            unit,
+            params["unit"][:n],
             len(geometry.units),
             {
                 "bias": noise.bias_std,
@@ -526,12 +521,6 @@ class Sequential(Detector):
                 "asymmetry": noise.nonlinearity_std,
             },
             {"bias": walk},
-        )
-        params["stride"] = max(round(0.5 * BLOCK_TIME * self.sample_rate), 1)
-        params["length"] = max(round(BLOCK_TIME * self.sample_rate), 1)
-        params["period"] = 1.0 / self.sample_rate
-        params["adaptation_gain"] = 1.0 / max(
-            0.5 * self.sample_rate / params["length"], 8.0
         )
         params["expected"][:n] = noise.noise_std**2
         params["timing"][:n] = np.maximum(noise.timing_std, LEAST_TIMING)
@@ -542,17 +531,40 @@ class Sequential(Detector):
         params["louder"] = louder
         params["rest_std"] = REST_STD
         params["bias_move"] = bias_move
-        used = all_sets(n)
-        singular = np.linalg.svd(used[:, :, None] * geometry.axes, compute_uv=False)
-        enough = used.sum(axis=1) >= MIN_CHANNELS
-        determines = (used.sum(axis=1) >= 3) & (
-            singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0]
-        )
-        params["determines"][: 1 << n] = determines
-        params["spans"][: 1 << n] = enough & determines
-        params["least"] = math.ceil(LEAST_TIME * self.sample_rate)
         params["limit"] = self.run_length
         params["confidence"] = confidence
+
+    def _fill_units(self) -> None:
+        """Fill the unit of each channel and the channels of each unit."""
+        params = self.constants[0]
+        units = self.geometry.units
+        params["units"] = len(units)
+        for number, channels in enumerate(units):
+            params["unit"][list(channels)] = number
+            params["members"][number] = mask_of(channels)
+
+    def _fill_times(self) -> None:
+        """Fill the lengths that depend on the sample rate."""
+        params = self.constants[0]
+        length = max(round(BLOCK_TIME * self.sample_rate), 1)
+        params["length"] = length
+        params["stride"] = max(round(0.5 * BLOCK_TIME * self.sample_rate), 1)
+        params["period"] = 1.0 / self.sample_rate
+        params["adaptation_gain"] = 1.0 / max(0.5 * self.sample_rate / length, 8.0)
+        params["least"] = math.ceil(LEAST_TIME * self.sample_rate)
+
+    def _fill_sets(self) -> None:
+        """Fill the sets of channels that give a rate, and those that also have redundancy."""
+        params = self.constants[0]
+        n = self.geometry.n
+        used = all_sets(n)
+        axes = used[:, :, None] * self.geometry.axes
+        singular = np.linalg.svd(axes, compute_uv=False)
+        spans = singular[:, -1] >= MIN_SINGULAR_RATIO * singular[:, 0]
+        count = used.sum(axis=1)
+        determines = (count >= 3) & spans
+        params["determines"][: 1 << n] = determines
+        params["spans"][: 1 << n] = (count >= MIN_CHANNELS) & determines
 
     def clear(self, declared: int = 0) -> None:
         """Drop all suspicion; keep the sensor errors, except the delay of a unit declared as a whole."""

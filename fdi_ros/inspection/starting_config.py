@@ -192,6 +192,10 @@ def _mounts_of(urdf: Urdf, chosen: Sequence[TopicReport]) -> tuple[Array, str]:
     return urdf.mounts(frames), words
 
 
+#: value of a parameter, and a remark on it
+_Setting = tuple[Any, str]
+
+
 def starting_config(
     chosen: Sequence[TopicReport], bag: Path, urdf: Urdf | None = None
 ) -> StartingConfig:
@@ -202,16 +206,36 @@ def starting_config(
     """
     kind = chosen[0].kind
     assert kind is not None
+    known = _settings_of_all(chosen, input_of(kind))
+    mounted = ""
+    if kind.stamped:
+        settings, mounted = _settings_of_units(chosen, urdf)
+        known |= settings
+    else:
+        known |= _settings_of_array(chosen[0], urdf)
+    if silent := _longer(chosen, GAP, 60.0):
+        known["health.stale_timeout"] = silent, f"the default is {_TIMEOUT:g} s"
+    return StartingConfig(
+        shown(bag.name),
+        {name: value for name, (value, _) in known.items()},
+        {name: words for name, (_, words) in known.items() if words},
+        mounted=mounted,
+    )
+
+
+def _settings_of_all(
+    chosen: Sequence[TopicReport], input_name: str
+) -> dict[str, _Setting]:
+    """Return the settings that units and arrays have in common."""
     rate = max(report.rate for report in chosen)
     # A single spike says nothing of the range.
     largest = np.fmax.reduce([report.lasting for report in chosen])
-    at_rest = rate * _REST >= MIN_LEARNED and all(map(_starts_at_rest, chosen))
     largest_rate = _rounded_up(
         float(np.fmax(max(PARAMETERS["health.max_rate"].default), 1.001 * largest))
     )
-    # Values of parameters, and remarks on them.
-    known: dict[str, tuple[Any, str]] = {
-        "input": (input_of(kind), ""),
+    at_rest = rate * _REST >= MIN_LEARNED and all(map(_starts_at_rest, chosen))
+    return {
+        "input": (input_name, ""),
         "sample_rate": (float(f"{rate:.4g}"), ""),
         "noise.noise_std": _noise_setting(chosen),
         "noise.scale_std": (
@@ -230,52 +254,57 @@ def starting_config(
             "NOT KNOWN: put in what the data sheet says",
         ),
     }
+
+
+def _settings_of_units(
+    chosen: Sequence[TopicReport], urdf: Urdf | None
+) -> tuple[dict[str, _Setting], str]:
+    """Return the settings of IMUs, and words for the source of their mounts, if any."""
     topics = [report.topic.name for report in chosen]
+    mounts = np.tile(np.eye(3), (len(chosen), 1, 1))
     mounted = ""
-    if kind.stamped:
-        words = (
-            "identity, NOT MEASURED: `fdi setup` finds how the units are turned against each other, from turns about"
-            " all axes. With two parallel units a fault is detected and not isolated; turned against each other, or"
-            " three of them, isolate it"
-        )
-        of_a_log = all(_LOG_TOPIC.fullmatch(topic) for topic in topics)
-        known["imus.topics"] = topics, ""
-        known["imus.names"] = unit_names(topics), "by the topics above"
-        mounts = np.tile(np.eye(3), (len(chosen), 1, 1))
-        if urdf is not None:
-            mounts, mounted = _mounts_of(urdf, chosen)
-            words = mounted
-        known["imus.mounts"] = mounts.ravel().tolist(), words
-        known["imus.max_skew"] = _rounded_up(0.2 / rate), ""
-        if of_a_log:
-            words = "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
-            known["decision.latch"] = False, words
-        if timeout := _longer(chosen, _BRIDGED, 10.0):
-            slowest = min(report.rate for report in chosen)
-            none = "none would be aligned between two"
-            words = f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s {none}"
-            known["imus.timeout"] = timeout, words
-    else:
-        if urdf is not None:
-            raise ConfigError(
-                f"no mounts from {urdf.name}: {shown(topics[0])} is an array of channels, which have no frame each"
-            )
-        words = (
-            "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns about all axes,"
-            " but for those of three reference channels: these must be right"
-        )
-        known["channels.topic"] = (topics[0], "")
-        known["geometry.preset"] = ("cone", words)
-        known["geometry.cone_channels"] = chosen[0].channels, ""
-    if silent := _longer(chosen, GAP, 60.0):
-        known["health.stale_timeout"] = silent, f"the default is {_TIMEOUT:g} s"
-    parameters = {name: value for name, (value, _) in known.items()}
-    return StartingConfig(
-        shown(bag.name),
-        parameters,
-        {name: words for name, (_, words) in known.items() if words},
-        mounted=mounted,
+    if urdf is not None:
+        mounts, mounted = _mounts_of(urdf, chosen)
+    assumed = (
+        "identity, NOT MEASURED: `fdi setup` finds how the units are turned against each other, from turns about"
+        " all axes. With two parallel units a fault is detected and not isolated; turned against each other, or"
+        " three of them, isolate it"
     )
+    known: dict[str, _Setting] = {
+        "imus.topics": (topics, ""),
+        "imus.names": (unit_names(topics), "by the topics above"),
+        "imus.mounts": (mounts.ravel().tolist(), mounted or assumed),
+        "imus.max_skew": (_rounded_up(0.2 / max(one.rate for one in chosen)), ""),
+    }
+    if all(_LOG_TOPIC.fullmatch(topic) for topic in topics):
+        words = "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
+        known["decision.latch"] = False, words
+    if timeout := _longer(chosen, _BRIDGED, 10.0):
+        slowest = min(report.rate for report in chosen)
+        none = "none would be aligned between two"
+        words = (
+            f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s {none}"
+        )
+        known["imus.timeout"] = timeout, words
+    return known, mounted
+
+
+def _settings_of_array(array: TopicReport, urdf: Urdf | None) -> dict[str, _Setting]:
+    """Return the settings of an array of channels. `ConfigError` with a URDF."""
+    topic = array.topic.name
+    if urdf is not None:
+        raise ConfigError(
+            f"no mounts from {urdf.name}: {shown(topic)} is an array of channels, which have no frame each"
+        )
+    words = (
+        "a guess, NOT MEASURED: give axes, or a preset. `fdi calibrate` finds all axes from turns about all axes,"
+        " but for those of three reference channels: these must be right"
+    )
+    return {
+        "channels.topic": (topic, ""),
+        "geometry.preset": ("cone", words),
+        "geometry.cone_channels": (array.channels, ""),
+    }
 
 
 def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
