@@ -161,6 +161,7 @@ VERBS = {
             "fdi replay my_flight --config my_gyros.yaml",
             "fdi replay bags/cone_flight --config two_imus.yaml --fault 'channel=imu_2.y kind=bias size=0.15 start=28'",
             "fdi replay my_flight --config my_gyros.yaml --report replay.html --check 'delay<1 isolated false=0'",
+            "fdi replay flight_8 --beside flight_7 --report both.html",
         ),
         {
             "bag": {},
@@ -180,6 +181,11 @@ VERBS = {
             ),
             "--detector": {},
             **PART,
+            "--beside": takes_path(
+                "replay this recording too, as recorded, and show both side by side in the report;"
+                " the exit code is that of the worse verdict",
+                metavar="BAG",
+            ),
             "--check": takes(
                 "exit with 1 and the reasons unless all conditions hold. For every injected fault: detected, delay<S,"
                 " isolated, isolated<S (S in s). Number of declarations without an injected fault: false=N, false<N."

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -37,11 +37,11 @@ from fdi_ros.monitor.building import build_geometry
 from fdi_ros.replay.conditions import Condition, failures, parse_check
 from fdi_ros.replay.failover import FailoverReplay, is_possible
 from fdi_ros.replay.outputs import CsvFile, OutputBag
-from fdi_ros.replay.page import Report
+from fdi_ros.replay.page import Replayed, Report, page_of
 from fdi_ros.replay.run import Sink, replay, with_unused
 from fdi_ros.replay.summary import Summary, as_json
 from fdi_ros.replay.words import AUTOPILOT_LOGS, sample_rate_notes, summary_text
-from fdi_ros.report.layout import unit_of
+from fdi_ros.report.layout import Severity, unit_of
 from fdi_ros.system import resolve
 from fdi_ros.system.files import whole, write_json, write_text
 from fdi_ros.system.text import shown, storable
@@ -54,6 +54,8 @@ if TYPE_CHECKING:
 class _Task(NamedTuple):
     """What a replay is asked for, checked before the recording is replayed."""
 
+    arguments: Namespace
+    """Arguments of the verb, with the recording to replay."""
     config: Config
     """The settings."""
     assumed: AssumedConfig | None
@@ -69,24 +71,25 @@ class _Task(NamedTuple):
 def run_replay(arguments: Namespace) -> int:
     """Replay a recording, print the result, write the files. Return the exit code."""
     task = _replay_task(arguments)
-    sources = [arguments.bag, *arguments.config, arguments.scenario]
+    other = _task_beside(arguments) if arguments.beside else None
+    tasks = [task, other] if other else [task]
+    sources = [arguments.bag, arguments.beside, *arguments.config, arguments.scenario]
     options = ("json", "csv", "report", "output")
     outputs = Outputs(arguments, options, sources, output=Kind.FOLDER)
-    refuse_unfit(arguments.bag, task.config)
-    failover: FailoverReplay | None = None
-    names = task.geometry.channel_names
-    if arguments.bag.suffix.lower() in AUTOPILOT_LOGS and is_possible(names):
-        failover = FailoverReplay(names)
-    summary, unmet = _replay_to_files(arguments, task, [failover] if failover else [])
-    text = summary_text(summary, unit_of(arguments.degrees))
-    if failover is not None:
-        text += f"{failover.text}\n"
-    text += _config_notes(arguments, task)
-    code = outputs.finish(text, severity=summary.verdict.severity)
+    for one in tasks:
+        refuse_unfit(one.arguments.bag, one.config)
+    replayed, unmet = _replay_to_files(arguments, tasks)
+    summary = replayed[0].summary
+    text = _replay_text(replayed[0])
+    for beside in replayed[1:]:
+        text += f"\nbeside it: {_replay_text(beside)}"
+    severities = [one.summary.verdict.severity for one in replayed]
+    worst = max(severities, key=list(Severity).index)
+    outputs.finish(text, severity=severities[0])
     if arguments.check is not None:
         return _report_check(arguments, outputs, summary, unmet)
     # With injected faults the verdict is on the monitor, not on the gyros.
-    return 0 if task.faults else code
+    return 0 if task.faults else worst.exit_code
 
 
 def _replay_task(arguments: Namespace) -> _Task:
@@ -106,49 +109,106 @@ def _replay_task(arguments: Namespace) -> _Task:
     if arguments.check is not None:
         channels = possible_names(config, geometry.channel_names)
         required = parse_check(arguments.check, len(faults), channels)
-    return _Task(config, assumed, faults, required, geometry)
+    return _Task(arguments, config, assumed, faults, required, geometry)
+
+
+def _task_beside(arguments: Namespace) -> _Task:
+    """Return the replay of the other recording: as recorded, and without a check or files."""
+    own = {"bag": arguments.beside, "fault": [], "scenario": None, "check": None}
+    files = dict.fromkeys(("csv", "output"))
+    return _replay_task(Namespace(**{**vars(arguments), **own, **files}))
+
+
+class _Replayed(NamedTuple):
+    """A replay that is done."""
+
+    task: _Task
+    """What was asked for."""
+    summary: Summary
+    """The result."""
+    report: Report | None
+    """Curves for the page, if one is asked for."""
+    failover: FailoverReplay | None
+    """What failover would have done, if this is the log of an autopilot."""
+
+    @property
+    def for_page(self) -> Replayed:
+        """The replay as a page needs it."""
+        assert self.report is not None
+        return Replayed(self.report, self.summary, _about_replay(self.task))
 
 
 def _replay_to_files(
-    arguments: Namespace, task: _Task, more: Sequence[Sink]
-) -> tuple[Summary, list[str]]:
-    """Replay and write all files or none. Return the result, and the unmet conditions."""
+    arguments: Namespace, tasks: Sequence[_Task]
+) -> tuple[list[_Replayed], list[str]]:
+    """Replay and write all files or none. Return the results, and the unmet conditions."""
     with progress(sys.stderr, arguments.quiet) as show, ExitStack() as stack:
-        sinks = [*_sinks(arguments, task.config, stack), *more]
-        report: Report | None = None
-        if arguments.report is not None:
-            unit = unit_of(arguments.degrees)
-            report = Report(task.geometry, task.config.sample_rate, unit)
-            sinks.append(report)
-        summary = replay(
-            arguments.bag,
-            task.config,
-            task.faults,
-            arguments.start,
-            arguments.end,
-            sinks=sinks,
-            progress=show,
-        )
-        if task.assumed:
-            summary = with_unused(summary, task.assumed.unused)
-        figures = as_json(summary)
-        unmet = failures(task.required, summary)
+        replayed = []
+        for number, one in enumerate(tasks):
+
+            def show_part(share: float, before: int = number) -> None:
+                show((before + share) / len(tasks))
+
+            replayed.append(_replay_one(one, "AB"[number], stack, show_part))
+        first = replayed[0]
+        figures = as_json(first.summary)
+        unmet = failures(tasks[0].required, first.summary)
         if arguments.check is not None:
-            conditions = [one.text for one in task.required]
+            conditions = [one.text for one in tasks[0].required]
             figures["check"] = {"required": conditions, "unmet": unmet}
-        if report:
-            page = report.html(summary, _about_replay(arguments, task))
+        for beside in replayed[1:]:
+            figures["beside"] = as_json(beside.summary)
+        if arguments.report is not None:
+            page = page_of([one.for_page for one in replayed])
             target = stack.enter_context(whole(arguments.report))
             target.write_text(page, encoding="utf-8")
         write_json(arguments.json, figures)
-    return summary, unmet
+    return replayed, unmet
 
 
-def _config_notes(arguments: Namespace, task: _Task) -> str:
+def _replay_one(
+    task: _Task, letter: str, stack: ExitStack, show: Callable[[float], None]
+) -> _Replayed:
+    """Replay one recording. ``letter``: begin of the names of the series on the page."""
+    arguments = task.arguments
+    sinks = _sinks(arguments, task.config, stack)
+    names = task.geometry.channel_names
+    failover: FailoverReplay | None = None
+    if arguments.bag.suffix.lower() in AUTOPILOT_LOGS and is_possible(names):
+        failover = FailoverReplay(names)
+        sinks.append(failover)
+    report: Report | None = None
+    if arguments.report is not None:
+        unit = unit_of(arguments.degrees)
+        report = Report(task.geometry, task.config.sample_rate, unit, f"{letter}.")
+        sinks.append(report)
+    summary = replay(
+        arguments.bag,
+        task.config,
+        task.faults,
+        arguments.start,
+        arguments.end,
+        sinks=sinks,
+        progress=show,
+    )
+    if task.assumed:
+        summary = with_unused(summary, task.assumed.unused)
+    return _Replayed(task, summary, report, failover)
+
+
+def _replay_text(replayed: _Replayed) -> str:
+    """Return the result of one replay for a terminal, the verdict first."""
+    text = summary_text(replayed.summary, unit_of(replayed.task.arguments.degrees))
+    if replayed.failover is not None:
+        text += f"{replayed.failover.text}\n"
+    return text + _config_notes(replayed.task)
+
+
+def _config_notes(task: _Task) -> str:
     """Return notes on an assumed config, or on topics that the given one does not name."""
     if task.assumed:
         return f"note: no --config: assumed {task.assumed.words}\n"
-    unused = not_configured(arguments.bag, task.config)
+    unused = not_configured(task.arguments.bag, task.config)
     return "".join(f"note: {line}\n" for line in unused)
 
 
@@ -189,7 +249,7 @@ def _written(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _about_replay(arguments: Namespace, task: _Task) -> dict[str, str]:
+def _about_replay(task: _Task) -> dict[str, str]:
     """Return the head of the report: what was replayed, and with which settings."""
     changed = [
         f"{name}: {_written(value)}" for name, value in task.config.changed.items()
@@ -200,10 +260,10 @@ def _about_replay(arguments: Namespace, task: _Task) -> dict[str, str]:
         "seeds": ", ".join(str(fault.seed) for fault in task.faults) or "none needed",
         "settings other than the default": "; ".join(changed),
     }
-    config = config_words(arguments)
+    config = config_words(task.arguments)
     if task.assumed and not config:
         config = f"none; assumed: {task.assumed.words}"
-    return about(arguments, config, more)
+    return about(task.arguments, config, more)
 
 
 # Many faults

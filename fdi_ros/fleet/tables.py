@@ -388,9 +388,8 @@ class Fleet:
             ),
             Section("What was run", "", about),
         ]
-        return page(
-            "fdi_ros: fleet", self.lines(), sections, severity=self.verdict.severity
-        )
+        _, *others = self.lines()
+        return page("fdi_ros: fleet", [self.verdict, *others], sections)
 
 
 def columns_of(flights: Sequence[Row]) -> list[Column]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,8 +42,10 @@ from fdi_ros.report.layout import (
     Columns,
     Figure,
     PageStore,
+    Pair,
     Section,
     Unit,
+    Verdict,
     colour_of,
     escape,
     head_and_rows,
@@ -115,16 +118,22 @@ class Curves:
         Of the figures on the page.
     quantity
         What the channels measure.
+    own
+        Begin of the names of its series, unlike those of other curves on the page.
     """
 
     def __init__(
-        self, geometry: Geometry, rate: float, unit: Unit, quantity: Quantity = RATE
+        self,
+        geometry: Geometry,
+        rate: float,
+        unit: Unit,
+        quantity: Quantity = RATE,
+        own: str = "",
     ) -> None:
         self.names = geometry.channel_names
         self.unit = unit
         self._words = WORDS[quantity]
-        #: begin of the names of its series
-        self._own = "" if quantity == RATE else f"{quantity.name}."
+        self._own = own
         norm = np.linalg.norm(geometry.axes, axis=1)
         self._sees = np.abs(geometry.axes) >= SEES_AXIS * norm[:, None]
         self._gain = geometry.axes / norm[:, None] ** 2
@@ -167,7 +176,7 @@ class Curves:
         """
         words = self._words
         last = len(self.names) - 1
-        of_residuals = {**scale, "scale": f"{self._own}residuals", **common}
+        of_residuals = {**scale, "scale": self._words.residuals, **common}
         levels = [
             self._line(f"level.{axis}", axis, colour_of(k))
             for k, axis in enumerate(_AXES)
@@ -219,7 +228,7 @@ class Curves:
         for i in np.flatnonzero(self._sees[:, k]).tolist():
             plus = [f"{self._own}residual.{i}", float(self._gain[i, k])]
             line = self._line(rate, self.names[i], colour_of(i), 1.1)
-            group = f"{self._own}channel {i}"
+            group = f"channel {i} {self.names[i]}"
             data.append({**line, "plus": plus, "legendgroup": group, "rank": i})
         data.append({**self._line(rate, "fused", _INK, 1.3), "rank": -1})
         title = f"{axis}, {self.unit.name}"
@@ -257,13 +266,18 @@ class Report(Sink):
         Samples per second, Hz.
     unit
         Of rates on the page.
+    own
+        Begin of the names of its series, for a page with two replays.
     """
 
-    def __init__(self, geometry: Geometry, rate: float, unit: Unit = RADIANS) -> None:
+    def __init__(
+        self, geometry: Geometry, rate: float, unit: Unit = RADIANS, own: str = ""
+    ) -> None:
         self._unit = unit
         self._sample_rate = rate
-        self._curves = [Curves(geometry, rate, unit)]
-        self._store = PageStore(self._curves[0].kinds)
+        self._own = own
+        self._curves = [Curves(geometry, rate, unit, own=own)]
+        self.store = PageStore(self._curves[0].kinds)
         self._first_states: list[str] = []
         self._origin: int | None = None
         """Stamp of time zero, ns. None: no sample yet."""
@@ -278,8 +292,8 @@ class Report(Sink):
         for curves in self._curves:
             if curves.spectrum:
                 curves.spectrum.begin_stretch()
-        self._store.add(
-            np.array([self._last]), np.full((1, len(self._store.kinds)), np.nan)
+        self.store.add(
+            np.array([self._last]), np.full((1, len(self.store.kinds)), np.nan)
         )
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
@@ -300,7 +314,7 @@ class Report(Sink):
             if k:
                 self.begin_stretch()
             if len(part):
-                self._store.add(time[part], columns[part])
+                self.store.add(time[part], columns[part])
                 self._last = float(time[part[-1]])
             for curves, half in halves:
                 if curves.spectrum:
@@ -313,11 +327,29 @@ class Report(Sink):
         _, accelerometers = pipeline.halves
         rate = self._sample_rate
         geometry = accelerometers.geometry
-        self._curves.append(Curves(geometry, rate, FORCES, FORCE))
-        self._store = PageStore(self._curves[0].kinds | self._curves[1].kinds)
+        own = f"{self._own}{FORCE.name}."
+        self._curves.append(Curves(geometry, rate, FORCES, FORCE, own))
+        self.store = PageStore(self._curves[0].kinds | self._curves[1].kinds)
 
     def html(self, summary: Summary, about: Mapping[str, str]) -> str:
         """Lay out the page: verdict, episodes, plots and tables. ``about``: head of the page."""
+        return page(
+            f"fdi_ros: {summary.bag}",
+            self.lines(summary),
+            self.sections(summary, about),
+            [self.store],
+            self._origin,
+        )
+
+    def lines(self, summary: Summary, letter: str = "") -> list[str | Verdict]:
+        """Return the sentences at the top, the verdict first, behind the letter of the replay."""
+        found = verdict_of(summary, self._unit)
+        name = f"{letter}, {Path(summary.bag).name}: " if letter else ""
+        verdict = Verdict(found.severity, f"{name}{found.sentence}")
+        return [verdict, *sentences(summary, self._unit)]
+
+    def sections(self, summary: Summary, about: Mapping[str, str]) -> list[Section]:
+        """Lay out episodes, plots and tables."""
         scores = summary.scores
         story = summary.story
         unit = self._unit
@@ -346,7 +378,7 @@ class Report(Sink):
         }
         statistics = [curves.statistic(spoken) for curves in self._curves]
         stretches = stretch_words(story)
-        sections = [
+        return [
             Section(
                 "The recording",
                 f"{self._zoom_hint()} {_marks_hint(summary)}",
@@ -373,26 +405,16 @@ class Report(Sink):
             Section("Notes", "", [*summary.monitor.degraded, *notes(summary)]),
             Section("What was run", "", {**about, **_protection_levels(summary, unit)}),
         ]
-        found = verdict_of(summary, unit)
-        lines = [found.sentence, *sentences(summary, unit)]
-        return page(
-            f"fdi_ros: {summary.bag}",
-            lines,
-            sections,
-            self._store,
-            found.severity,
-            self._origin,
-        )
 
     def _zoom_hint(self) -> str:
         words = (
             "Drag across a plot to zoom all plots in time, double-click to see "
             "everything; arrow keys move the cursor. PNG and CSV at the corner of a plot save it."
         )
-        if self._store.width == 1:
+        if self.store.width == 1:
             return words
         return (
-            f"{words} A long recording: of every {self._store.width} samples the smallest and the largest value are"
+            f"{words} A long recording: of every {self.store.width} samples the smallest and the largest value are"
             " drawn; close up, the lines between them are no course of time."
         )
 
@@ -574,6 +596,73 @@ def _plot(
         "data": data,
         "layout": time_layout(height, last, yaxis={"title": {"text": title}}, **layout),
     }
+
+
+# Two replays side by side
+
+
+class Replayed(NamedTuple):
+    """A replay for a page with two."""
+
+    report: Report
+    """Its curves. The begins of the names of the series of two reports differ."""
+    summary: Summary
+    """Its result."""
+    about: Mapping[str, str]
+    """Head of its page."""
+
+
+def page_of(replays: Sequence[Replayed]) -> str:
+    """Lay out one replay, or two side by side, A and B, over the same axes."""
+    if len(replays) == 1:
+        report, summary, about = replays[0]
+        return report.html(summary, about)
+    first, second = replays
+    lines: list[str | Verdict] = []
+    lettered = []
+    for letter, (report, summary, about) in zip("AB", (first, second), strict=True):
+        lines += report.lines(summary, letter)
+        lettered.append(_lettered(report.sections(summary, about), letter))
+    title = f"fdi_ros: {first.summary.bag} beside {second.summary.bag}"
+    stores = [first.report.store, second.report.store]
+    return page(title, lines, _paired(*lettered), stores)
+
+
+def _lettered(sections: Sequence[Section], letter: str) -> list[Section]:
+    """Begin the title of each plot with the letter of its replay."""
+    return [
+        replace(one, figures=[_titled(figure, letter) for figure in one.figures])
+        for one in sections
+    ]
+
+
+def _titled(figure: Mapping[str, Any], letter: str) -> Figure:
+    title = f"{letter} {figure['layout'].get('title', '')}".rstrip()
+    return {**figure, "layout": {**figure["layout"], "title": title}}
+
+
+def _paired(firsts: Sequence[Section], seconds: Sequence[Section]) -> list[Pair]:
+    """Pair the sections of two replays by their titles, and give their plots the same axes."""
+    by_title = {one.title: one for one in seconds}
+    pairs = [Pair(one, by_title.pop(one.title, None)) for one in firsts]
+    pairs += [Pair(None, one) for one in by_title.values()]
+    for pair in pairs:
+        for place, row in enumerate(pair.rows):
+            layouts = [figure["layout"] for figure in row if figure is not None]
+            if len(layouts) == 2:
+                _share_axes(layouts, f"{pair.title} {place}")
+    return pairs
+
+
+def _share_axes(layouts: Sequence[dict[str, Any]], name: str) -> None:
+    """Give two plots the same range of x, the same cursor, and the same scale of values."""
+    kinds = [layout.get("yaxis", {}).get("type") for layout in layouts]
+    for layout in layouts:
+        layout.setdefault("link", name)
+        if "rows" not in layout:
+            layout.setdefault("scale", name)
+        if "log" in kinds:
+            layout["yaxis"]["type"] = "log"
 
 
 # States and marks over time

@@ -12,7 +12,7 @@ The scripts beside this file draw the plots in the browser. A figure is a mappin
 
 They also draw traces ``band`` (x, low, high) and ``spans`` (row, from, to, text, pattern), and series of a
 `PageStore` (``packed``, with ``plus`` or ``spread``). The layout has ``title``, ``link`` (plots with
-this name share zoom and cursor), ``scale`` (plots with this name share the scale of values),
+this name share range, zoom and cursor), ``scale`` (plots with this name share the scale of values),
 ``robust`` (short peaks do not set the scale), ``needed`` (times that the scale must cover), ``marks``
 (x, kind, text, ``label``) and ``rows`` of spans.
 """
@@ -29,6 +29,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from importlib import resources
+from itertools import zip_longest
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
@@ -238,6 +239,45 @@ class Section:
     """Plots, each a `Figure`."""
 
 
+class Pair(NamedTuple):
+    """The same part of two replays, one beside the other. None: one replay lacks it."""
+
+    first: Section | None
+    """Part of the first replay, on the left, or above on a narrow screen."""
+    second: Section | None
+    """Part of the second replay."""
+
+    @property
+    def title(self) -> str:
+        """Title of both."""
+        return self._shown.title
+
+    @property
+    def hint(self) -> str:
+        """Sentence below the title."""
+        return self._shown.hint
+
+    @property
+    def figures(self) -> list[Mapping[str, Any]]:
+        """Plots of both in turn."""
+        return [one for row in self.rows for one in row if one is not None]
+
+    @property
+    def rows(self) -> list[tuple[Mapping[str, Any] | None, ...]]:
+        """Plots in rows of two. None: one replay has fewer plots."""
+        return list(zip_longest(*([*one.figures] if one else [] for one in self)))
+
+    @property
+    def _shown(self) -> Section:
+        shown_one = self.first or self.second
+        assert shown_one is not None
+        return shown_one
+
+
+Part = Section | Pair
+"""One part of a page, between two heads."""
+
+
 def section_lines(section: Section) -> list[str]:
     """Lay out a section for a terminal, without plots. The content must be no HTML."""
     lines = [section.title, *textwrap.wrap(section.hint, TERMINAL)]
@@ -332,46 +372,37 @@ def html_of(content: Content) -> str:
 
 def page(
     title: str,
-    summary: Sequence[str],
-    sections: Sequence[Section],
-    store: PageStore | None = None,
-    severity: Severity | None = None,
+    summary: Sequence[str | Verdict],
+    parts: Sequence[Part],
+    stores: Sequence[PageStore] = (),
     origin: int | None = None,
 ) -> str:
     """Lay out a page.
 
-    ``summary``: sentences at the top, the first of which is the verdict. ``severity``: colour of the
-    verdict. None: no verdict. ``store``: long series, which figures reference by ``packed``.
-    ``origin``: time zero in UTC, ns. None: unknown.
+    ``summary``: sentences at the top, verdicts in the colour of their severity. ``stores``: long
+    series, which figures reference by ``packed``. ``origin``: time zero in UTC, ns. None: unknown.
     """
-    looks = [
-        "" if severity is None else f" class={severity.value}",
-        *[""] * len(summary),
-    ]
     links = "".join(
-        f'<a href="#{_anchor(section)}">{escape(section.title)}</a>'
-        for section in sections
+        f'<a href="#{_anchor(part)}">{escape(part.title)}</a>' for part in parts
     )
     body: list[str] = []
     figures: list[Mapping[str, Any]] = []
-    for section in (_speaking(section, store) for section in sections):
-        body += _section(section, len(figures))
-        figures += section.figures
-    parts = {
+    for part in parts:
+        drawn_part = _drawn_part(part, stores)
+        body += _section(drawn_part, len(figures))
+        figures += drawn_part.figures
+    filled = {
         "TITLE": escape(title),
-        "VERDICT": "".join(
-            f"<li{look}>{escape(line)}</li>"
-            for look, line in zip(looks, summary, strict=False)
-        ),
+        "VERDICT": "".join(map(_summary_line, summary)),
         "CONTENTS": f'<nav aria-label="contents">{links}</nav>'
-        if len(sections) >= FEWEST_LINKED
+        if len(parts) >= FEWEST_LINKED
         else "",
-        "BODY": "\n".join(part for part in body if part),
+        "BODY": "\n".join(line for line in body if line),
         "STYLE": _resource("page.css"),
         "DATA": _safe_json(
             {
                 "figures": figures,
-                "store": None if store is None else store.data(),
+                "stores": [store.data() for store in stores],
                 "origin": None
                 if origin is None or date_of(origin) is None
                 else origin // 1_000_000,
@@ -381,21 +412,35 @@ def page(
     }
     # One pass, so that inserted text is not searched for placeholders.
     return re.sub(
-        "<!--([A-Z]+)-->", lambda place: parts[place[1]], _resource("page.html")
+        "<!--([A-Z]+)-->", lambda place: filled[place[1]], _resource("page.html")
     )
 
 
-def _anchor(section: Section) -> str:
-    """Return the name of a section in a link."""
-    return re.sub("[^a-z0-9]+", "-", section.title.lower()).strip("-")
+def _summary_line(line: str | Verdict) -> str:
+    """Return one sentence at the top of the page."""
+    if isinstance(line, Verdict):
+        return f"<li class={line.severity.value}>{escape(line.words)}</li>"
+    return f"<li>{escape(line)}</li>"
 
 
-def _speaking(section: Section, store: PageStore | None) -> Section:
+def _anchor(part: Part) -> str:
+    """Return the name of a part in a link."""
+    return re.sub("[^a-z0-9]+", "-", part.title.lower()).strip("-")
+
+
+def _drawn_part(part: Part, stores: Sequence[PageStore]) -> Part:
+    """Return a part without empty plots."""
+    if isinstance(part, Section):
+        return _speaking(part, stores)
+    return Pair(*(one and _speaking(one, stores) for one in part))
+
+
+def _speaking(section: Section, stores: Sequence[PageStore]) -> Section:
     """Return a section without empty plots. If no plot is left, a sentence states that."""
     figures = [
         figure
         for figure in section.figures
-        if any(_draws(trace, store) for trace in figure["data"])
+        if any(_draws(trace, stores) for trace in figure["data"])
     ]
     if len(figures) == len(section.figures):
         return section
@@ -403,35 +448,49 @@ def _speaking(section: Section, store: PageStore | None) -> Section:
     return replace(section, figures=figures, hint=f"{section.hint} {words}".strip())
 
 
-def _draws(trace: Mapping[str, Any], store: PageStore | None) -> bool:
+def _draws(trace: Mapping[str, Any], stores: Sequence[PageStore]) -> bool:
     """Whether a trace has any value."""
     if "packed" in trace:
-        return store is not None and store.shows(trace["packed"])
+        name = trace["packed"]
+        return any(name in store.kinds and store.shows(name) for store in stores)
     values = trace.get(
         {"band": "low", "spans": "row", "heatmap": "z"}.get(trace["type"], "y"), ()
     )
     return any(value is not None for value in values)
 
 
-def _section(section: Section, number: int) -> list[str]:
-    """Lay out a section with figures numbered from ``number``."""
-    head = f"<h2>{escape(section.title)}</h2>" + (
-        f'<p class="hint">{escape(section.hint)}</p>' if section.hint else ""
+def _section(part: Part, number: int) -> list[str]:
+    """Lay out a part with figures numbered from ``number``."""
+    head = f"<h2>{escape(part.title)}</h2>" + (
+        f'<p class="hint">{escape(part.hint)}</p>' if part.hint else ""
     )
-    if not section.figures:
-        return [
-            f'<section id="{_anchor(section)}">{head}{html_of(section.content)}</section>'
+    if isinstance(part, Section):
+        content = html_of(part.content)
+        rows = [_place(number + k) for k in range(len(part.figures))]
+    else:
+        content = _pair_row(html_of(one.content) if one else "" for one in part)
+        numbers = iter(range(number, number + len(part.figures)))
+        rows = [
+            _pair_row("" if one is None else _place(next(numbers)) for one in row)
+            for row in part.rows
         ]
-    numbers = range(number, number + len(section.figures))
-    places = [
-        f'<figure data-figure="{k}"><div class="stage" tabindex="0"></div></figure>'
-        for k in numbers
-    ]
+    if not rows:
+        return [f'<section id="{_anchor(part)}">{head}{content}</section>']
     # On paper the title stays with the first plot.
-    first = f'<div class="keep">{head}<div class="legend"></div>{places[0]}</div>'
-    begin = f'<section id="{_anchor(section)}" class="plots">{first}'
-    end = f"{html_of(section.content)}</section>"
-    return [begin, *places[1:], end]
+    first = f'<div class="keep">{head}<div class="legend"></div>{rows[0]}</div>'
+    begin = f'<section id="{_anchor(part)}" class="plots">{first}'
+    return [begin, *rows[1:], f"{content}</section>"]
+
+
+def _place(number: int) -> str:
+    """Return the place of a figure."""
+    return f'<figure data-figure="{number}"><div class="stage" tabindex="0"></div></figure>'
+
+
+def _pair_row(cells: Iterable[str]) -> str:
+    """Return cells one beside the other, or nothing if all are empty."""
+    row = "".join(f"<div>{cell}</div>" for cell in cells)
+    return f'<div class="pair">{row}</div>' if row != "<div></div><div></div>" else ""
 
 
 def time_layout(height: int, last: bool = True, **more: Any) -> dict[str, Any]:

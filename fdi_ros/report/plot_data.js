@@ -15,17 +15,16 @@ const half = (bits) => { // IEEE 754 binary16: half the size, and 0.05 % is fine
 };
 
 // Series of a long recording hold the smallest and the largest value of each span of samples, one after the other.
-const store = (() => {
-  if (!page.store) return { time: new Float64Array(), get: () => null };
-  const time = new Float64Array(bytes(page.store.time)), step = page.store.width > 1 ? 2 : 1, known = {};
-  const read = ([kind, text]) => {
-    const buffer = bytes(text);
-    const values = kind === "f2" ? Float32Array.from(new Uint16Array(buffer), half) : new Float32Array(buffer);
-    if (step === 1) return { low: values, high: values };
-    return { low: values.filter((_, i) => i % 2 === 0), high: values.filter((_, i) => i % 2 === 1) };
-  };
-  return { time, get: (name) => (known[name] ??= read(page.store.series[name])) };
-})();
+const stores = page.stores.map(({ time, width, series }) => ({ time: new Float64Array(bytes(time)), step: width > 1 ? 2 : 1, series }));
+const known = {};
+const read = (name) => {
+  const { time, step, series } = stores.find((store) => name in store.series), [kind, text] = series[name];
+  const buffer = bytes(text);
+  const values = kind === "f2" ? Float32Array.from(new Uint16Array(buffer), half) : new Float32Array(buffer);
+  if (step === 1) return { time, low: values, high: values };
+  return { time, low: values.filter((_, i) => i % 2 === 0), high: values.filter((_, i) => i % 2 === 1) };
+};
+const stored = (name) => (known[name] ??= read(name));
 
 const number = (value) => (value === null || value === undefined ? NaN : +value);
 
@@ -37,13 +36,13 @@ const curveOf = (trace) => {
     const y = Array.from(trace.y ?? [], number);
     return { x, low: y, high: y };
   }
-  const base = store.get(trace.packed), x = store.time;
+  const base = stored(trace.packed), x = base.time;
   if (trace.type === "band") {
-    const [name, factor] = trace.spread, spread = store.get(name).high;
+    const [name, factor] = trace.spread, spread = stored(name).high;
     return { x, low: base.low.map((v, i) => v - factor * spread[i]), high: base.high.map((v, i) => v + factor * spread[i]) };
   }
   if (!trace.plus) return { x, low: base.low, high: base.high };
-  const [name, factor] = trace.plus, more = store.get(name);
+  const [name, factor] = trace.plus, more = stored(name);
   if (base.low === base.high) {
     const sum = base.low.map((v, i) => v + factor * more.low[i]);
     return { x, low: sum, high: sum };

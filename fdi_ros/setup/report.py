@@ -31,6 +31,7 @@ from fdi_ros.report.layout import (
     Section,
     Severity,
     Unit,
+    Verdict,
     colour_of,
     drawn,
     escape,
@@ -916,13 +917,9 @@ def setup_page(found: SetupResult, bag: str, config: str, unit: Unit = RADIANS) 
             f'<div class="scroll"><pre>{escape(found.text)}</pre></div>',
         )
     )
-    summary = [first, *(f"Found: {line}." for line in lines)]
-    return page(
-        f"fdi_ros: settings from {bag}",
-        summary,
-        sections,
-        severity=verdict_of(findings).severity,
-    )
+    verdict = Verdict(verdict_of(findings).severity, first)
+    found_lines = (f"Found: {line}." for line in lines)
+    return page(f"fdi_ros: settings from {bag}", [verdict, *found_lines], sections)
 
 
 def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Section]:

@@ -368,7 +368,7 @@ def test_no_curve_is_drawn_over_a_hole():
     time = 0.01 * np.arange(200) + 2.0 * np.searchsorted(
         [50, 100, 150], np.arange(200), side="right"
     )
-    store = data_of(made(Geometry.cone(6), time, noise(200, 6)))["store"]
+    store = data_of(made(Geometry.cone(6), time, noise(200, 6)))["stores"][0]
     kind, series = store["series"]["residual.3"]
     values = np.frombuffer(base64.b64decode(series), dtype=f"<{kind}")
     time = np.frombuffer(base64.b64decode(store["time"]), dtype="<f8")
@@ -512,3 +512,62 @@ def test_a_page_draws_temperatures_and_modes_of_a_log(folder):
     drawn = data["figures"][titles.index({"text": "temperature, °C"})]["data"]
     assert [one["name"] for one in drawn] == ["imu_1", "imu_2", "imu_3"]
     assert 37.8 < min(drawn[0]["y"]) < max(drawn[0]["y"]) < 38.4
+
+
+def test_two_replays_stand_side_by_side_over_the_same_axes(driver, folder, flight):
+    path = folder / "both.html"
+    other = folder / "other.json"
+    words = [*REPLAY, "--fault", FAULTS[0], "--beside", str(flight)]
+    words += ["--end", "40", "--report", str(path), "--json", str(other)]
+    assert command_line.main(words) == 0
+    figures = json.loads(other.read_text())
+    assert figures["verdict"]["word"] == "FOUND"
+    assert figures["beside"]["verdict"]["word"] == "HEALTHY"
+    text = path.read_text()
+    assert "<li class=good>A, cone_flight: 1 of 1 injected fault detected" in text
+    assert "<li class=good>B, cone_flight: HEALTHY: " in text
+    opened(driver, path)
+    assert complaints(driver) == []
+    charts = "sections.flatMap(s => s.plots)"
+    titles = ask(driver, f"{charts}.map(c => c.title)")
+    ranges = ask(driver, f"{charts}.map(c => [...c.x.range, ...c.y.range])")
+    assert [title[0] for title in titles] == ["A", "B"] * (len(titles) // 2)
+    assert len(titles) == 2 * 13
+    for k in range(0, len(titles), 2):
+        assert titles[k][1:] == titles[k + 1][1:]
+        assert ranges[k] == ranges[k + 1], titles[k]
+    # The fault of 0.2 rad/s shows on the left alone.
+    offs = "columns([c.traces[0].curve], [25, 30], 1)[0]"
+    left, right = ask(
+        driver, f"{charts}.filter(c => c.title.includes('g2,')).map(c => {offs})"
+    )
+    assert left[0] > 0.1
+    assert right[1] < 0.05
+    across = "[...document.querySelectorAll('figure')].map(f => f.getBoundingClientRect().left)"
+    columns = ask(driver, across)
+    assert len({round(left) for left in columns}) == 2
+    with phone(driver):
+        wait(driver, f"new Set({across}).size === 1")
+        assert ask(driver, "document.documentElement.scrollWidth") <= 390
+
+
+def test_two_replays_of_different_gyros_stand_on_one_page(folder, root):
+    path = folder / "unlike.html"
+    table = folder / "still.csv"
+    random = np.random.default_rng(3)
+    names = [f"imu{k}_{axis}" for k in (1, 2) for axis in "xyz"]
+    rows = np.column_stack([0.02 * np.arange(600), random.normal(0, 0.002, (600, 6))])
+    head = ",".join(["time", *names])
+    np.savetxt(table, rows, "%.6f", delimiter=",", header=head, comments="")
+    crash = root / "bags" / "copter_crash.tlog"
+    words = ["replay", str(table), "--beside", str(crash), "--report", str(path)]
+    # The exit code is that of the worse verdict, here of the second.
+    assert command_line.main(words) == 3
+    layouts = [one["layout"] for one in data_of(path.read_text())["figures"]]
+    assert {one["title"][0] for one in layouts} == {"A", "B"}
+    in_degrees = [
+        one["title"]
+        for one in layouts
+        if one.get("yaxis", {}).get("title", {}).get("text") == "temperature, °C"
+    ]
+    assert in_degrees == ["B"]
