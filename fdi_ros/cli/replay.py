@@ -37,7 +37,7 @@ from fdi_ros.monitor.building import build_geometry
 from fdi_ros.replay.conditions import Condition, failures, parse_check
 from fdi_ros.replay.failover import FailoverReplay, is_possible
 from fdi_ros.replay.outputs import CsvFile, OutputBag
-from fdi_ros.replay.page import Replayed, Report, page_of
+from fdi_ros.replay.page import Replayed, Report, page_of, report_of
 from fdi_ros.replay.run import Sink, replay, with_unused
 from fdi_ros.replay.summary import Summary, as_json
 from fdi_ros.replay.words import AUTOPILOT_LOGS, sample_rate_notes, summary_text
@@ -179,8 +179,7 @@ def _replay_one(
         sinks.append(failover)
     report: Report | None = None
     if arguments.report is not None:
-        unit = unit_of(arguments.degrees)
-        report = Report(task.geometry, task.config.sample_rate, unit, f"{letter}.")
+        report = report_of(task.config, unit_of(arguments.degrees), f"{letter}.")
         sinks.append(report)
     summary = replay(
         arguments.bag,

@@ -39,7 +39,7 @@ from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import Episode
-from fdi_ros.replay.page import Report
+from fdi_ros.replay.page import report_of
 from fdi_ros.replay.run import Sink, replay, with_unused
 from fdi_ros.replay.summary import Summary
 from fdi_ros.replay.words import sample_rate_notes
@@ -276,7 +276,7 @@ def _judged(
             flight = replace(flight, calibration=storable(f"refused: {error}"))
     config = Config.from_parameters(parameters_of(text))
     seen = _Seen(config)
-    page = Report(build_geometry(config), config.sample_rate) if reports else None
+    page = report_of(config) if reports else None
     sinks = [seen, page] if page else [seen]
     summary = with_unused(replay(path, config, sinks=sinks), unused)
     if seen.hardware_id:

@@ -14,10 +14,12 @@ import numpy as np
 
 from fdi_ros.bag.flight_context import Course
 from fdi_ros.bag.samples import Samples
+from fdi_ros.config.config import Config
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.quantity import FORCE, RATE, Quantity
 from fdi_ros.model.samples import Array, Block
+from fdi_ros.monitor.building import GUARD, build_geometry, build_noise
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import (
@@ -30,6 +32,7 @@ from fdi_ros.replay.episodes import (
     unit_for,
 )
 from fdi_ros.replay.outcomes import Outcome, StateChange
+from fdi_ros.replay.own_evidence import OwnEvidence
 from fdi_ros.replay.run import Sink
 from fdi_ros.replay.summary import AutopilotText, ChannelResult, Summary
 from fdi_ros.replay.verdict import verdict_of
@@ -112,6 +115,8 @@ class Curves:
     ----------
     geometry
         Channels, n.
+    noise_std
+        (n,) standard deviation of the noise of each channel.
     rate
         Samples per second, Hz.
     unit
@@ -125,6 +130,7 @@ class Curves:
     def __init__(
         self,
         geometry: Geometry,
+        noise_std: Array,
         rate: float,
         unit: Unit,
         quantity: Quantity = RATE,
@@ -144,6 +150,9 @@ class Curves:
         #: names and kinds of its series
         self.kinds = {f"{self._own}{name}": kind for name, kind in kinds.items()}
         self.spectrum = Spectrum(self.names, rate) if there("scipy") else None
+        alone = [f"{own}alone.{i}" for i in range(geometry.n)]
+        #: evidence against channels that are left out
+        self.alone = OwnEvidence(geometry, noise_std, alone)
         #: largest statistic and threshold
         self._peaks = np.zeros(2)
 
@@ -156,13 +165,21 @@ class Curves:
         self._peaks = np.maximum(self._peaks, largest)
         return np.column_stack([judged, np.column_stack(vectors) * self.unit.factor])
 
-    def statistic(self, layout: Mapping[str, Any]) -> Figure:
-        """Draw the statistic and its threshold."""
-        log = self._peaks[0] > LOG_FROM * self._peaks[1] > 0
+    def statistic(self, layout: Mapping[str, Any], alone: bool) -> Figure:
+        """Draw the statistic and its threshold, and the evidence against channels left out."""
         lines = [
             self._line("statistic", "statistic", _INK, 1.2),
             self._line("threshold", "threshold", "#e0662f", 1.8, dash="dash"),
         ]
+        largest = self._peaks[0]
+        if alone:
+            largest = max(largest, self.alone.peak)
+            lines += [
+                self._line(f"alone.{i}", f"{name} alone", colour_of(i), 1.6, dash="dot")
+                for i, name in enumerate(self.names)
+                if self.alone.store.shows(f"{self._own}alone.{i}")
+            ]
+        log = largest > LOG_FROM * self._peaks[1] > 0
         figure = _plot(lines, 240, self._words.statistic, True, layout)
         figure["layout"]["yaxis"]["type"] = "log" if log else "linear"
         return figure
@@ -261,7 +278,9 @@ class Report(Sink):
     Parameters
     ----------
     geometry
-        Gyros.
+        Gyros, n.
+    noise_std
+        (n,) standard deviation of the noise of each gyro, rad/s.
     rate
         Samples per second, Hz.
     unit
@@ -271,13 +290,18 @@ class Report(Sink):
     """
 
     def __init__(
-        self, geometry: Geometry, rate: float, unit: Unit = RADIANS, own: str = ""
+        self,
+        geometry: Geometry,
+        noise_std: Array,
+        rate: float,
+        unit: Unit = RADIANS,
+        own: str = "",
     ) -> None:
         self._unit = unit
         self._sample_rate = rate
         self._own = own
-        self._curves = [Curves(geometry, rate, unit, own=own)]
-        self.store = PageStore(self._curves[0].kinds)
+        self._curves = [Curves(geometry, noise_std, rate, unit, own=own)]
+        self._store = PageStore(self._curves[0].kinds)
         self._first_states: list[str] = []
         self._origin: int | None = None
         """Stamp of time zero, ns. None: no sample yet."""
@@ -292,8 +316,8 @@ class Report(Sink):
         for curves in self._curves:
             if curves.spectrum:
                 curves.spectrum.begin_stretch()
-        self.store.add(
-            np.array([self._last]), np.full((1, len(self.store.kinds)), np.nan)
+        self._store.add(
+            np.array([self._last]), np.full((1, len(self._store.kinds)), np.nan)
         )
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
@@ -308,13 +332,15 @@ class Report(Sink):
         halves = list(zip(self._curves, output.halves, strict=True))
         time = np.asarray((output.stamp - (self._origin or 0)) * 1e-9)
         columns = np.column_stack([curves.columns(half) for curves, half in halves])
+        for curves, half in halves:
+            curves.alone.add(time, half)
         # Curves also break at holes within a stretch.
         holes = np.flatnonzero(np.diff(time, prepend=self._last or time[0]) > HOLE)
         for k, part in enumerate(np.split(np.arange(len(time)), holes)):
             if k:
                 self.begin_stretch()
             if len(part):
-                self.store.add(time[part], columns[part])
+                self._store.add(time[part], columns[part])
                 self._last = float(time[part[-1]])
             for curves, half in halves:
                 if curves.spectrum:
@@ -327,9 +353,10 @@ class Report(Sink):
         _, accelerometers = pipeline.halves
         rate = self._sample_rate
         geometry = accelerometers.geometry
+        noise_std = accelerometers.noise.noise_std
         own = f"{self._own}{FORCE.name}."
-        self._curves.append(Curves(geometry, rate, FORCES, FORCE, own))
-        self.store = PageStore(self._curves[0].kinds | self._curves[1].kinds)
+        self._curves.append(Curves(geometry, noise_std, rate, FORCES, FORCE, own))
+        self._store = PageStore(self._curves[0].kinds | self._curves[1].kinds)
 
     def html(self, summary: Summary, about: Mapping[str, str]) -> str:
         """Lay out the page: verdict, episodes, plots and tables. ``about``: head of the page."""
@@ -337,9 +364,14 @@ class Report(Sink):
             f"fdi_ros: {summary.bag}",
             self.lines(summary),
             self.sections(summary, about),
-            [self.store],
+            self.stores,
             self._origin,
         )
+
+    @property
+    def stores(self) -> list[PageStore]:
+        """All series of the curves."""
+        return [self._store, *(curves.alone.store for curves in self._curves)]
 
     def lines(self, summary: Summary, letter: str = "") -> list[str | Verdict]:
         """Return the sentences at the top, the verdict first, behind the letter of the replay."""
@@ -376,12 +408,16 @@ class Report(Sink):
             "marks": [*common["marks"], *said],
             "backdrop": _throttle(summary),
         }
-        statistics = [curves.statistic(spoken) for curves in self._curves]
+        # The statistics of other methods have another meaning than the evidence.
+        alone = summary.detector == GUARD
+        for curves in self._curves:
+            curves.alone.finish()
+        statistics = [curves.statistic(spoken, alone) for curves in self._curves]
         stretches = stretch_words(story)
         return [
             Section(
                 "The recording",
-                f"{self._zoom_hint()} {_marks_hint(summary)}",
+                f"{self._zoom_hint()} {_marks_hint(summary)}{self._alone_hint(alone)}",
                 "",
                 [states, *statistics],
             ),
@@ -406,15 +442,24 @@ class Report(Sink):
             Section("What was run", "", {**about, **_protection_levels(summary, unit)}),
         ]
 
+    def _alone_hint(self, alone: bool) -> str:
+        """Explain the evidence against channels that are left out."""
+        if not alone or all(curves.alone.peak == 0.0 for curves in self._curves):
+            return ""
+        return (
+            " The evidence falls when a channel is named, because the others agree. Dotted:"
+            " the evidence against that channel alone, from its residual in each second."
+        )
+
     def _zoom_hint(self) -> str:
         words = (
             "Drag across a plot to zoom all plots in time, double-click to see "
             "everything; arrow keys move the cursor. PNG and CSV at the corner of a plot save it."
         )
-        if self.store.width == 1:
+        if self._store.width == 1:
             return words
         return (
-            f"{words} A long recording: of every {self.store.width} samples the smallest and the largest value are"
+            f"{words} A long recording: of every {self._store.width} samples the smallest and the largest value are"
             " drawn; close up, the lines between them are no course of time."
         )
 
@@ -598,6 +643,13 @@ def _plot(
     }
 
 
+def report_of(config: Config, unit: Unit = RADIANS, own: str = "") -> Report:
+    """Return the empty page of a replay with these settings; unit and own as of `Report`."""
+    geometry = build_geometry(config)
+    noise_std = build_noise(config, geometry.n).noise_std
+    return Report(geometry, noise_std, config.sample_rate, unit, own)
+
+
 # Two replays side by side
 
 
@@ -624,7 +676,7 @@ def page_of(replays: Sequence[Replayed]) -> str:
         lines += report.lines(summary, letter)
         lettered.append(_lettered(report.sections(summary, about), letter))
     title = f"fdi_ros: {first.summary.bag} beside {second.summary.bag}"
-    stores = [first.report.store, second.report.store]
+    stores = [*first.report.stores, *second.report.stores]
     return page(title, lines, _paired(*lettered), stores)
 
 

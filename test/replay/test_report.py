@@ -330,7 +330,7 @@ def made(geometry, time, residual, faults=(), episodes=(), bag="bag"):
     """The page of samples at these times, s, and with these residuals (N, n), and the faults and episodes of them."""
     random, drawn, count = (
         np.random.default_rng(0),
-        Report(geometry, 1 / np.diff(time).min()),
+        Report(geometry, np.full(geometry.n, 0.01), 1 / np.diff(time).min()),
         len(time),
     )
     for rows in np.array_split(np.arange(count), max(2, count // 50_000)):
