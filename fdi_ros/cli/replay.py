@@ -175,7 +175,7 @@ def _replay_one(
     names = task.geometry.channel_names
     failover: FailoverReplay | None = None
     if arguments.bag.suffix.lower() in AUTOPILOT_LOGS and is_possible(names):
-        failover = FailoverReplay(names)
+        failover = FailoverReplay(names, task.config.sample_rate)
         sinks.append(failover)
     report: Report | None = None
     if arguments.report is not None:

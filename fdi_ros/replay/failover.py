@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.mavlink.failover import PARAMETERS
+from fdi_ros.mavlink.failover import OVERSAMPLING, PARAMETERS
 from fdi_ros.mavlink.failover_evidence import DOUBTS, LARGE, SILENT, Evidence
 from fdi_ros.mavlink.failover_policy import (
     PolicySettings,
@@ -21,13 +21,14 @@ from fdi_ros.mavlink.failover_policy import (
     decide,
 )
 from fdi_ros.mavlink.failover_words import imu_name
-from fdi_ros.mavlink.protocol import MS, NS
+from fdi_ros.mavlink.protocol import NS
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.run import Sink
 
-INTERVAL = 20 * MS  #: The link of a vehicle brings samples at this interval, ns.
+#: Shortest interval of the samples that are compared, ns: that of a live link at 50 Hz.
+SHORTEST = round(NS / (50.0 * OVERSAMPLING))
 BEGIN = 10 * NS  #: Time of the policy at the start of the recording, ns.
 BEFORE = 3 * NS  #: The policy looks at this time before a doubt, ns: IMUs gain trust,
 AFTER = 40 * NS  #: and at this time after it, ns: longer than every pause.
@@ -49,10 +50,13 @@ class FailoverReplay(Sink):
     ----------
     channels
         Names of all gyro channels, three for each IMU.
+    rate
+        Sample rate of the recording, Hz.
     """
 
-    def __init__(self, channels: Sequence[str]) -> None:
+    def __init__(self, channels: Sequence[str], rate: float) -> None:
         self._channels = channels
+        self._interval = max(SHORTEST, round(NS / rate))
         self._count = len(channels) // 3
         self._settings = PolicySettings()
         self._state = PolicyState.begin(self._count)
@@ -65,9 +69,10 @@ class FailoverReplay(Sink):
 
     def begin_stretch(self) -> None:
         """Forget what was compared: the next samples come after a long gap."""
-        self._evidence = Evidence(self._count, INTERVAL, self._settings.min_size)
+        least = self._settings.min_size
+        self._evidence = Evidence(self._count, self._interval, least)
         self._delivered = [0] * self._count
-        self._waiting: deque[_Sample] = deque(maxlen=BEFORE // INTERVAL)
+        self._waiting: deque[_Sample] = deque(maxlen=BEFORE // self._interval)
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Take the next samples."""
@@ -84,7 +89,8 @@ class FailoverReplay(Sink):
             self._until = stamp + AFTER if matters[row] else self._until
             if stamp < self._next:
                 continue
-            self._next = stamp + INTERVAL - MS
+            # On average at this interval, as an autopilot sends.
+            self._next = max(self._next, stamp - SHORTEST) + SHORTEST
             sample = _Sample(stamp, rates[row].tolist(), states[row].tolist())
             self._waiting.append(sample)
             while stamp <= self._until and self._waiting:

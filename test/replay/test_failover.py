@@ -17,9 +17,9 @@ NAMES = CONFIG.channel_names
 INTERVAL = 20_000_000
 
 
-def recorded(seconds=80.0, seed=1):
+def recorded(seconds=80.0, seed=1, interval=INTERVAL):
     """Rates of three IMUs in gentle motion, (N, 9) rad/s."""
-    t = np.arange(0.0, seconds, INTERVAL * 1e-9)
+    t = np.arange(0.0, seconds, interval * 1e-9)
     rates = np.column_stack(
         [0.5 * np.sin(0.8 * t), 0.4 * np.cos(1.1 * t), 0.3 * np.sin(0.5 * t)]
     )
@@ -29,7 +29,7 @@ def recorded(seconds=80.0, seed=1):
 
 def orders(rates):
     """Orders in a recording, by what is said before " at ", and their times, s."""
-    replay = FailoverReplay(NAMES)
+    replay = FailoverReplay(NAMES, CONFIG.sample_rate)
     stamp = 10**18 + INTERVAL * np.arange(len(rates))
     Walk(Pipeline(CONFIG), [replay]).take(Block(stamp, rates))
     _, _, text = replay.text.partition(": ")
@@ -38,7 +38,7 @@ def orders(rates):
 
 
 def test_a_healthy_recording_has_no_order():
-    replay = FailoverReplay(NAMES)
+    replay = FailoverReplay(NAMES, CONFIG.sample_rate)
     Walk(Pipeline(CONFIG), [replay]).take(Block(INTERVAL * np.arange(4000), recorded()))
     assert replay.text == (
         "failover, if armed: no IMU would be taken out (failover_min_size 0.03 rad/s)"
@@ -57,6 +57,19 @@ def test_the_orders_of_failover_in_a_recording(error, latest):
     assert back == "IMU 2 in use again"
     assert 40.0 <= begin <= 40.0 + latest
     assert 52.0 <= end <= 52.5
+
+
+@pytest.mark.parametrize("frequency", [49.8, 100.3])
+def test_vibration_near_a_multiple_of_50_hz_is_no_error_in_a_fast_recording(frequency):
+    """Compared every 20 ms it would be a slow error of 0.8 rad/s."""
+    interval = 5_000_000
+    rates = recorded(40.0, interval=interval)
+    t = 0.005 * np.arange(len(rates))
+    rates[:, 6] += 0.8 * np.sin(2.0 * np.pi * frequency * t) * (t > 30.0)
+    config = CONFIG.replaced({"sample_rate": 200.0})
+    replay = FailoverReplay(NAMES, config.sample_rate)
+    Walk(Pipeline(config), [replay]).take(Block(interval * np.arange(len(t)), rates))
+    assert "no IMU would be taken out" in replay.text
 
 
 def test_failover_works_with_two_or_three_imus_of_three_channels():
