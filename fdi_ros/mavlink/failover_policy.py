@@ -186,8 +186,6 @@ class PolicyState(NamedTuple):
     announced: Mapping[int, Announced] = {}
     boots: int = 0
     at: int = NEVER  #: Time of the last tick.
-    lanes_lost: bool = False  #: One EKF lane or none is left, for `LASTING`.
-    lanes_since: int | None = None  #: Since when this is otherwise, ns.
 
     @classmethod
     def begin(
@@ -295,11 +293,10 @@ def decide(
                 memory.out_sent = now
             else:
                 memory.back_sent = now
-    lost, since = _lanes(state, memories, view, now)
     announced = dict(state.announced)
     words = []
     # Without a link nobody would read them.
-    found = _conditions(memories, view, now, lost) if view.linked else []
+    found = _conditions(memories, view, now) if view.linked else []
     for key, condition in found:
         is_fine = condition is Condition.FINE
         if is_fine and not view.imus[key].size < settings.min_size:
@@ -321,7 +318,7 @@ def decide(
     return Decision(
         orders=tuple(orders),
         words=tuple(words),
-        state=PolicyState(memories, announced, view.boots, now, lost, since),
+        state=PolicyState(memories, announced, view.boots, now),
         hurry=(view.armed and doubtful) or unsettled,
     )
 
@@ -458,20 +455,8 @@ def _is_due(
     return memory.ours and unanswered
 
 
-def _lanes(
-    state: PolicyState, memories: Sequence[Memory], view: View, now: int
-) -> tuple[bool, int | None]:
-    """Return whether at most one EKF lane is left, and since when that is otherwise."""
-    good = sum(memory.lane_angle < LOST_LANE for memory in memories)
-    lost = good <= 1 if view.armed else state.lanes_lost
-    if lost == state.lanes_lost:
-        return lost, None
-    since = now if state.lanes_since is None else state.lanes_since
-    return (lost, None) if now - since >= LASTING else (not lost, since)
-
-
 def _conditions(
-    memories: Sequence[Memory], view: View, now: int, lanes_lost: bool
+    memories: Sequence[Memory], view: View, now: int
 ) -> list[tuple[int, Condition]]:
     """Return the condition of each IMU and of the vehicle: the first that applies."""
     longest = [_has_stood(memory.apart_since, UNNAMED, now) for memory in memories]
@@ -484,11 +469,12 @@ def _conditions(
     ]
     alive = sum(not _has_stood(memory.dead_since, REACTION, now) for memory in memories)
     left = sum(memory.seen is not False for memory in memories)
+    lanes = sum(memory.lane_angle < LOST_LANE for memory in memories)
     by_us = any(memory.ours and memory.seen is False for memory in memories)
     checks = (
         (view.armed and alive <= 1, Condition.ALONE),
         (view.armed and by_us and left <= 1, Condition.LAST_IMU),
-        (lanes_lost, Condition.LAST_LANE),
+        (lanes <= 1, Condition.LAST_LANE),
         (view.armed and any(longest) and not is_any_ok, Condition.DISAGREE),
     )
     found.append((VEHICLE, _first(checks, Condition.REDUNDANT)))
