@@ -133,16 +133,26 @@ def with_forces(one, arms, noise=0.05, seed=0):
     return forces_of(one, arms, noise, seed).block
 
 
+def turned(steps):
+    """Return the attitude before each of the turns (N, 3), rad, each in the body frame of its time."""
+    turns = np.vstack([np.zeros(3), steps[:-1]])
+    products = Rotation.from_rotvec(turns).as_quat()
+    reach = 1
+    while reach < len(products):
+        # Each product grows to twice its length: log2(N) products of arrays.
+        before = Rotation.from_quat(products[:-reach])
+        products[reach:] = (before * Rotation.from_quat(products[reach:])).as_quat()
+        reach *= 2
+    return Rotation.from_quat(products)
+
+
 def forces_of(one, arms, noise=0.05, seed=0):
     """Add accelerometers at arms (units, 3), m, to a vehicle; errors of 0.2 m/s^2 and 0.5 %."""
     rng, t = np.random.default_rng([21, seed]), (one.block.stamp - START) * 1e-9
     step, z = 2e-3, np.empty((len(t), len(arms), 3))
     fine = np.arange(-DELAY - 0.01, t[-1] + DELAY + 0.01, step)
     rate = one.motion.rate_at(fine)
-    turn, attitude = Rotation.identity(), np.empty((len(fine), 3))
-    for k, step_turn in enumerate(Rotation.from_rotvec(rate * step)):
-        attitude[k] = turn.inv().apply([0.0, 0.0, 9.81])
-        turn = turn * step_turn
+    attitude = turned(rate * step).inv().apply([0.0, 0.0, 9.81])
     alpha = np.gradient(rate, step, axis=0)
     axes, bias = np.empty((len(arms), 3, 3)), np.empty((len(arms), 3))
     for k, arm in enumerate(arms):

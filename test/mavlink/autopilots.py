@@ -59,7 +59,7 @@ def gentle(units: int, seed: int = 0, noise: float = 0.002) -> Motion:
 
 def milli(value: float) -> int:
     """Cut off to whole thousandths, as a cast in C does."""
-    return int(np.clip(value * 1000.0, -32768, 32767))
+    return int(min(max(value * 1000.0, -32768.0), 32767.0))
 
 
 MESSAGES = {
