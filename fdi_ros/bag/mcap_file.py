@@ -25,6 +25,7 @@ import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 
 from fdi_ros.bag.raw import (
@@ -51,7 +52,13 @@ from fdi_ros.system.files import (
     RECORDS,
 )
 
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0B
+# As whole numbers, which compiled code compares with bytes.
+FOOTER = int(Opcode.FOOTER)
+SCHEMA = int(Opcode.SCHEMA)
+CHANNEL = int(Opcode.CHANNEL)
+MESSAGE = int(Opcode.MESSAGE)
+CHUNK = int(Opcode.CHUNK)
+STATISTICS = int(Opcode.STATISTICS)
 #: bytes of a record before its content: opcode, length of the content
 _PREFIX = 9
 #: bytes of a message record before the message: channel, sequence, log time, publish

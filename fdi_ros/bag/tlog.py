@@ -49,12 +49,10 @@ from fdi_ros.system.files import (
     TLOG_BYTES,
 )
 
-_HEARTBEAT, _AUTOPILOT_VERSION, _STATUSTEXT = 0, 148, 253
-_PARAM_VALUE, _VFR_HUD = 22, 74
-_BESIDE = (_HEARTBEAT, _PARAM_VALUE, _VFR_HUD, _STATUSTEXT, _AUTOPILOT_VERSION)
+_IMUS = tuple(message.name for message in MESSAGES.values())
+_BESIDE = ("HEARTBEAT", "PARAM_VALUE", "VFR_HUD", "STATUSTEXT", "AUTOPILOT_VERSION")
 """Messages that are read beside the rates."""
 _DEVICE = re.compile(r"INS_GYR([23]?)_ID")
-_AUTOPILOT_COMPONENT = 1
 #: first bytes of messages of MAVLink 1 and 2
 _MARKS = (0xFE, 0xFD)
 _TIME = 8
@@ -107,7 +105,7 @@ class Tlog(LibraryLog):
         self.system, autopilot = chosen
         found: defaultdict[Source, bytearray] = defaultdict(bytearray)
         beside: list[tuple[int, Any]] = []
-        for at, end, message in self._messages(data, (*MESSAGES, *_BESIDE)):
+        for at, end, message in self._messages(data, (*_IMUS, *_BESIDE)):
             if message.get_srcSystem() != self.system:
                 continue
             came = int.from_bytes(data[at : at + _TIME], "big")
@@ -155,24 +153,24 @@ class Tlog(LibraryLog):
 
     def _take_beside(self, message: Any, came: int, autopilot: int) -> None:
         """Take a text, a mode, the throttle or an id. ``came``: us since 1970."""
-        number = message.get_msgId()
-        if number == _AUTOPILOT_VERSION:
+        name = message.get_type()
+        if name == "AUTOPILOT_VERSION":
             serial = bytes(message.uid2).hex()
             self.hardware_id = serial.strip("0") and serial
         if self.start_utc is None:
             return
         stamp = came - self.start_utc
-        if number == _STATUSTEXT:
+        if name == "STATUSTEXT":
             self.add_text(stamp, "STATUSTEXT", str(message.text))
-        elif number == _HEARTBEAT and message.autopilot == autopilot:
+        elif name == "HEARTBEAT" and message.autopilot == autopilot:
             if autopilot == ARDUPILOT:
                 vehicle = VEHICLES.get(message.type, "")
                 self.add_mode(stamp, ardupilot_mode(vehicle, message.custom_mode))
             else:
                 self.add_mode(stamp, px4_heartbeat_mode(message.custom_mode))
-        elif number == _VFR_HUD:
+        elif name == "VFR_HUD":
             self.throttle.add(np.array([stamp]), np.array([message.throttle]))
-        elif number == _PARAM_VALUE:
+        elif name == "PARAM_VALUE":
             found = _DEVICE.fullmatch(str(message.param_id))
             if found and 0 < message.param_value < LARGEST_DEVICE:
                 self.devices[int(found[1] or 1) - 1] = int(message.param_value)
@@ -186,10 +184,10 @@ class Tlog(LibraryLog):
 
     def _autopilot(self, data: bytes) -> tuple[int, int] | None:
         """Return system and MAV_AUTOPILOT of the autopilot to read, or None."""
-        for _, _, beat in self._messages(data, (_HEARTBEAT,)):
+        for _, _, beat in self._messages(data, ("HEARTBEAT",)):
             if beat.autopilot != NO_AUTOPILOT:
                 return beat.get_srcSystem(), beat.autopilot
-        for _, _, message in self._messages(data, tuple(MESSAGES)):
+        for _, _, message in self._messages(data, _IMUS):
             system = message.get_srcSystem()
             self.note(
                 f"it has no HEARTBEAT of an autopilot: system {system} is read, which"
@@ -211,14 +209,15 @@ class Tlog(LibraryLog):
             self.note(f"{self._lost} bytes belong to no whole record and were left out")
 
     def _messages(
-        self, data: bytes, numbers: tuple[int, ...]
+        self, data: bytes, names: Sequence[str]
     ) -> Iterator[tuple[int, int, Any]]:
-        """Yield the valid messages of autopilots with these ids, and count the lost bytes.
+        """Yield the valid messages of autopilots with these names, and count the lost bytes.
 
         Yields begin and end of the record in the file, bytes, and the decoded message.
         """
         codec = dialect()
         parser = codec.MAVLink(None)
+        wanted = {getattr(codec, f"MAVLINK_MSG_ID_{name}") for name in names}
         at = lost = 0
         while at + _LEAST <= len(data):
             end = record_end(data, at)
@@ -236,8 +235,8 @@ class Tlog(LibraryLog):
                 else data[start + 5]
             )
             if (
-                number in numbers
-                and data[start + (6 if second else 4)] == _AUTOPILOT_COMPONENT
+                number in wanted
+                and data[start + (6 if second else 4)] == codec.MAV_COMP_ID_AUTOPILOT1
             ):
                 with contextlib.suppress(codec.MAVError):
                     yield at, end, parser.decode(bytearray(data[start:end]))
