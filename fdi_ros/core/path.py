@@ -42,16 +42,18 @@ from fdi_ros.core.restamping import restamp
 from fdi_ros.core.states import alive, left_out, out_of_use, update_states, write_events
 from fdi_ros.core.subsets import fill_rate
 
-#: A channel is noisy from this multiple of the expected noise on: its weight in the
-#: rate is then a tenth.
+#: A channel is noisy from this multiple of the expected or its usual noise on: its weight
+#: in the rate is then a tenth.
 NOISY = 3.0
-#: A noisy channel must also exceed every channel of the other units by this factor:
+#: This multiple must also exceed that of every channel of the other units by this factor:
 #: vibration of the body shows on more than one unit.
-NOISIER = 1.4
+NOISIER = 1.8
 #: Share of the range. If the others predict less, a value out of range is a fault.
 RAIL_MARGIN = 0.9
-#: Multiple of the expected noise below which a channel is never noisy.
-LOUD = 1.5
+#: Smallest usual noise, as a share of the expected noise: at rest a value may repeat.
+QUIET = 0.3
+#: Time without noise after which noise is a new spell, ns.
+NOISY_BREAK = 1_000_000_000
 #: Time constants with which the usual noise follows more and less noise, s.
 LOUDER_TIME, QUIETER_TIME = 120.0, 10.0
 #: A value out of range is limited to this many ranges before the detector sees it.
@@ -320,7 +322,7 @@ def update_noisy(core: Core) -> None:
     """Find channels much noisier than expected or usual.
 
     A noisy channel must also be noisier than all distinguishable channels of other
-    units.
+    units. In the first seconds the usual noise is not known.
     """
     settings = core.settings
     noise = core.now.verdict.noise
@@ -333,18 +335,50 @@ def update_noisy(core: Core) -> None:
             usual[i] += (min(share, 1.0) if usual[i] > 0.0 else 1.0) * (
                 noise[i] - usual[i]
             )
-        is_loud = noise[i] > LOUD and noise[i] > NOISY * usual[i]
-        if noise[i] < NOISY and not is_loud:
-            continue
-        own = unit_of(settings, i)
-        above = True
-        for j in range(settings.n):
-            is_other = not own >> j & 1 and not settings.sensors.alike[i, j]
-            if is_other and noise[j] * NOISIER > noise[i]:
-                above = False
-        if above:
+    if core.samples * settings.period < QUIETER_TIME:
+        return
+    for i in range(settings.n):
+        times = times_as_noisy(core, i)
+        if times >= NOISY and exceeds_others(core, i, times):
             core.now.noisy |= 1 << i
             core.health.noisy[i] += 1
+            extend_spell(core, i, times)
+
+
+@compiled
+def times_as_noisy(core: Core, i: int) -> float:
+    """Return the noise of a channel over the expected or usual one, whichever is smaller."""
+    usual = min(max(core.health.usual_noise[i], QUIET), 1.0)
+    return core.now.verdict.noise[i] / usual
+
+
+@compiled
+def exceeds_others(core: Core, i: int, times: float) -> bool:
+    """Whether the noise of a channel has grown more than that of all other units."""
+    settings = core.settings
+    own = unit_of(settings, i)
+    for j in range(settings.n):
+        is_other = not own >> j & 1 and not settings.sensors.alike[i, j]
+        if is_other and times_as_noisy(core, j) * NOISIER > times:
+            return False
+    return True
+
+
+@compiled
+def extend_spell(core: Core, i: int, times: float) -> None:
+    """Add the present sample, with its multiple of the expected noise, to a noisy spell."""
+    stamp = core.now.evidence.stamp
+    last = core.health.last_noisy
+    longest = core.health.longest_noisy
+    if stamp - last.until[i] > NOISY_BREAK:
+        last.since[i] = stamp
+        last.times[i] = 0.0
+    last.until[i] = stamp
+    last.times[i] = max(last.times[i], times)
+    if stamp - last.since[i] >= longest.until[i] - longest.since[i]:
+        longest.since[i] = last.since[i]
+        longest.until[i] = stamp
+        longest.times[i] = last.times[i]
 
 
 @compiled

@@ -269,6 +269,15 @@ class Condition(IntEnum):
 
 
 @record
+class NoisySpell:
+    """A time in which a channel was noisy, with breaks below `NOISY_BREAK`."""
+
+    since: Stamps  # first noisy sample, ns; 0: there was none
+    until: Stamps  # last noisy sample so far, ns
+    times: Channels  # largest noise, over the noise expected
+
+
+@record
 class Health:
     """Memory of the checks of single channels, and their result in this sample."""
 
@@ -290,6 +299,8 @@ class Health:
     usual_noise: (
         Channels  # recent noise relative to noise_std, slow to follow increases
     )
+    last_noisy: NoisySpell
+    longest_noisy: NoisySpell
     gone: Channels  # share of non-finite values among the recent ones
     absent: Channels  # share of recent samples without a value
     lapses: Channels  # recent number of samples without a value after one with a value

@@ -41,9 +41,12 @@ from fdi_ros.detectors.sums import (
     KEPT,
     PER_BLOCK,
     SIZES,
+    Scale,
     Scales,
     forget_sums,
     look_back,
+    normal_variance,
+    value_at,
 )
 from fdi_ros.estimator.error_states import ErrorStates, copy_states
 from fdi_ros.estimator.estimator import (
@@ -55,7 +58,7 @@ from fdi_ros.estimator.estimator import (
     Estimator,
     update_weights,
 )
-from fdi_ros.estimator.noise import BLOCK, SCALES, update_unknown
+from fdi_ros.estimator.noise import BLOCK, SAMPLE, SCALES, update_unknown
 from fdi_ros.estimator.snapshots import (
     is_after_hole,
     move_biases,
@@ -89,6 +92,12 @@ sensors warm, or rectify vibration."""
 UNSOLVED = 10.0
 """Time after which a case that no hypothesis explains ends, s. The error model is wrong there,
 and while all channels are suspects, the estimator learns nothing better."""
+LOUDER = 4.0
+"""Noise variance since the onset over the learned one, from which the noise has grown: the samples of
+a fault are as noisy as before."""
+STEPS, JUMPS = 16, 2
+"""Smallest number of differences that show how noisy the last samples are, and number of the
+largest ones among them that are left out: the onset of a fault is no noise."""
 MOVE_TIME = 1.0
 """Age of a fault, s, from which it must exceed what healthy biases move in flight. In simulated
 thermal shocks of 6 mrad/s a healthy gyro is named in 17 of 48 flights without this, in 9
@@ -121,6 +130,7 @@ class Case:
     isolated: Mask  # faulty channels, named for long enough
     suspects: Mask  # a set with at least one faulty channel
     witnesses: Mask  # channels present when the suspects were found
+    louder: Flag  # a channel has become noisier
     healthy_move: Real  # standard deviation of the move of each healthy bias since the onset, rad/s
     unsolved: Real  # time without an explaining hypothesis, less the time with one, s
     retry: Whole  # earliest sample at which a case may open again
@@ -413,6 +423,7 @@ def name_channels(params: Constants, state: State) -> None:
     if (kf.samples - kf.returned) * params.period > LEAST_RETURN:
         # A mean across a gap belongs to different motion.
         size = min(size, kf.samples - kf.returned + 1)
+    case.louder = fill_louder(params, state, size)
     explain_case(params, kf, case, size, 0.0)
     std = 0.0 if case.isolated else moved_by(inference, params.sensors.n)
     if std > 0.0 and let_biases_move(params, state, std):
@@ -429,6 +440,50 @@ def name_channels(params: Constants, state: State) -> None:
     case.suspects = inference.union
     isolate(params, kf, case)
     leave_aside(params, state)
+
+
+@compiled
+def fill_louder(params: Constants, state: State, size: int) -> bool:
+    """Find how much noisier the last ``size`` samples are than the learned noise; return whether any channel is.
+
+    A channel that becomes noisy shows means that its learned noise does not explain.
+    """
+    kf = state.estimator
+    scale = state.scales[SAMPLE]
+    inference = state.case.inference
+    is_louder = False
+    for i in range(params.sensors.n):
+        inference.louder[i] = 0.0
+        if kf.judged >> i & 1:
+            grown = mean_step(scale, i, min(max(size - 1, STEPS), KEPT - 1), JUMPS)
+            if 1 < size <= JUMPS + 1:
+                grown = max(grown, mean_step(scale, i, size - 1, 0))
+            grown *= normal_variance(kf, i)
+            inference.louder[i] = max(grown - LOUDER, 0.0) * kf.noise.now.sample[i]
+            is_louder = is_louder or inference.louder[i] > 0.0
+    return is_louder
+
+
+@compiled
+def mean_step(scale: Scale, i: int, steps: int, without: int) -> float:
+    """Return half the mean square of the last differences of channel i, without the largest ones.
+
+    ``without`` is the number of these, at most 2. White noise of variance one gives one.
+    """
+    squares = first = second = 0.0
+    for k in range(steps):
+        step = value_at(scale, k, i) - value_at(scale, k + 1, i)
+        square = 0.5 * step * step
+        squares += square
+        if square > first:
+            second = first
+            first = square
+        else:
+            second = max(second, square)
+    if without == 0:
+        return squares / steps
+    # These two of m squares of normal values have a sum of 3.5 log m - 2.6 on average.
+    return (squares - first - second) / (steps - 3.5 * math.log(steps) + 2.6)
 
 
 @compiled
@@ -604,7 +659,10 @@ def leave_aside(params: Constants, state: State) -> None:
 
 @compiled
 def follow_case(params: Constants, state: State) -> None:
-    """Name the channels of an open case again when it has grown, and end it without evidence."""
+    """Name the channels of an open case again when it has grown, and end it without evidence.
+
+    A mean that fades in a second of quiet noise may be a fault that comes and goes.
+    """
     kf = state.estimator
     case = state.case
     if kf.samples < case.next:
@@ -613,7 +671,7 @@ def follow_case(params: Constants, state: State) -> None:
     if (
         case.open
         and case.inference.log_odds < ENDS
-        and (kf.samples - case.onset) * params.period > 1.0
+        and (case.louder or (kf.samples - case.onset) * params.period > 1.0)
     ):
         forget_evidence(params, state)
         update_weights(params, kf)

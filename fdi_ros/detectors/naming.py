@@ -95,6 +95,7 @@ class Inference:
     before: Total  # sums of all samples before the mean
     y: Channels  # values less their estimated errors, rad/s
     covariance: Square  # M, (rad/s)^2
+    louder: Channels  # variance of a sample since the onset beyond the learned one, (rad/s)^2
     moved: Real  # by which each bias may have moved since the onset, rad/s
     rate: Vector  # mean body rate, rad/s
     angular_acceleration: (
@@ -217,6 +218,7 @@ def add_noise(
     moves = 1.0 if kf.noise.regime == MOTION else 0.0
     for i in range(params.sensors.n):
         noise = noise_of_mean(params, kf.noise, i, size)
+        noise += inference.louder[i] / size
         speed = moves * (kf.total.speed[i] - inference.before.speed[i]) / size
         bent = params.nonlinearity[i] * speed
         moved = inference.moved * inference.moved

@@ -311,7 +311,9 @@ def fill_verdict(
     fill_scores(params, state.estimator, state.scales, verdict.scores)
     for i in range(n):
         variance = kf.shared.level[i] * odd
-        verdict.noise[i] = math.sqrt(variance / params.expected[i])
+        # What other channels share with this one is no noise of its own.
+        own = kf.noise.now.sample[i] * kf.noise.quick[i]
+        verdict.noise[i] = math.sqrt(own / params.expected[i])
         sample.estimate.corrected[i] = kf.corrected[i]
         sample.estimate.variance[i] = variance
         sample.estimate.bias[i] = kf.states.x[i]

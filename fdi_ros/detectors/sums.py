@@ -182,6 +182,14 @@ def look_back(
 
 
 @compiled
+def normal_variance(kf: Estimator, i: int) -> float:
+    """Return the variance of the statistic of a sample, by recent noise and by slow noise."""
+    noise = kf.noise
+    slow = noise.now.level[BLOCK, i] * noise.unknown[i] * noise.longest[i]
+    return max(1.0, BURST * noise.quick[i], slow)
+
+
+@compiled
 def update_from_sample(
     params: Constants, kf: Estimator, scales: Scales, learns: bool
 ) -> None:
@@ -193,9 +201,8 @@ def update_from_sample(
     for i in range(params.sensors.n):
         scale.series[scale.newest, i] = 0.0
         if kf.judged >> i & 1:
-            slow = noise.now.level[BLOCK, i] * noise.unknown[i] * noise.longest[i]
             scale.series[scale.newest, i] = kf.statistic[i] / math.sqrt(
-                max(1.0, BURST * noise.quick[i], slow)
+                normal_variance(kf, i)
             )
     update_shared(params, kf)
     update_sample_noise(

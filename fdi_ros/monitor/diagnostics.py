@@ -266,13 +266,6 @@ def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
     if unit == FORCE.unit:
         own = status.config.accelerometers.max_drift
         section = "accelerometers"
-    if channel.noisy:
-        times = (
-            f"{channel.noise:.2g}" if channel.noise < 100 else f"{channel.noise:.0f}"
-        )
-        words.append(
-            f"noise {times} times noise_std, and larger than in the other units"
-        )
     if abs(channel.drift) > NEARLY * own > 0:
         limit = f"a fault beyond {own:g} ({section}.max_drift)"
         words.append(f"bias has drifted by {_figure(channel.drift)} {unit}, {limit}")

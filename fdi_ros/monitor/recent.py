@@ -31,8 +31,10 @@ from fdi_ros.monitor.soundness import (
 
 if TYPE_CHECKING:
     from fdi_ros.monitor.diagnostics import InputStatus
-    from fdi_ros.monitor.status import Status
+    from fdi_ros.monitor.status import ChannelStatus, Status
 
+SECOND = 1_000_000_000
+"""One second, ns."""
 READINGS = 60
 """Number of readings that are kept, one per second."""
 LEAST_READINGS = 10
@@ -112,9 +114,16 @@ class RecentHealth:
                 delivered=float(delivered) if measured else 1.0,
                 spikes=int(spikes[i]),
                 saturated_s=float(at_end[i]) / status.config.sample_rate,
+                noisy_s=one.last_noisy.seconds if self._was_noisy(status, one) else 0.0,
+                noisy_from_s=(one.last_noisy.since - status.stamp) / SECOND,
+                noisy_times=one.last_noisy.times,
                 residual_rms_rad_s=rms[i],
                 measured_in=one.unit,
             )
+
+    def _was_noisy(self, status: Status, channel: ChannelStatus) -> bool:
+        """Whether the last spell of noise reaches into the time of the readings."""
+        return status.stamp - channel.last_noisy.until < READINGS * SECOND
 
     def _rate_health(self) -> RateHealth:
         """Return how long the fused rate was missing, to a second."""

@@ -30,6 +30,8 @@ LEAST_DELIVERED = 0.9
 """Share of its messages that a healthy unit delivers."""
 LEAST_MISSING_S = 1.0
 """Time without a fused rate that is reported, s. Shorter outages are in the notes."""
+LEAST_NOISY_S = 3.0
+"""Duration of noise that is reported, s."""
 LEAST_SPIKES = 3
 """Single wrong samples from which on a channel has spikes. Fewer may be chance."""
 
@@ -66,6 +68,12 @@ class ChannelHealth:
     residual_rms_rad_s: float | None = None
     """Root mean square of its difference from the fused rate while it was OK, rad/s.
     None: never OK, or not measured."""
+    noisy_s: float = 0.0
+    """Duration of its longest spell of noise, s."""
+    noisy_from_s: float = 0.0
+    """Start of that spell, s. Negative: as long before now."""
+    noisy_times: float = 0.0
+    """Its largest noise in that spell, over its usual or expected noise, the smaller one."""
     measured_in: str = "rad/s"
     """Unit of its figures: rad/s of a gyro, m/s^2 of an accelerometer."""
     doubt: str = ""
@@ -123,9 +131,11 @@ class Concern(NamedTuple):
     """Channels, units or topics, or the fused rate."""
     words: str
     """What is wrong, as it continues the names: ``has 24 spikes``."""
+    joined_by: str = "and"
+    """``or``: about one of the names, and which one is not known."""
 
     def __str__(self) -> str:
-        return f"{listed(short_names(self.who))} {self.words}"
+        return f"{listed(short_names(self.who), self.joined_by)} {self.words}"
 
 
 def short_names(names: Sequence[str]) -> list[str]:
@@ -208,6 +218,7 @@ def concerns_of(
             for one in channels
             if one.spikes >= LEAST_SPIKES
         ),
+        *_noisy_for_a_time([one for one in channels if _is_noisy(one)]),
         *(
             concern
             for unit in dict.fromkeys(one.measured_in for one in channels)
@@ -296,8 +307,47 @@ def _doubts(some: Sequence[ChannelHealth]) -> list[Concern]:
     ]
 
 
+def _is_noisy(one: ChannelHealth) -> bool:
+    return one.noisy_s >= LEAST_NOISY_S
+
+
+def _noisy_for_a_time(channels: Sequence[ChannelHealth]) -> list[Concern]:
+    """Return concerns about channels that were noisy for a time, one for each time.
+
+    Channels of several units that are noisy at once measure the same axis: only their
+    difference is known, and one of them is noisy.
+    """
+    found = []
+    left = sorted(channels, key=lambda one: -one.noisy_s)
+    while left:
+        first = left[0]
+        same = [one for one in left if _are_noisy_together(one, first)]
+        left = [one for one in left if one not in same]
+        began = first.noisy_from_s
+        when = f"from {began:.1f} s" if began >= 0.0 else f"{-began:.0f} s ago"
+        words = (
+            f"had noise {max(one.noisy_times for one in same):.2g} times as large as usual"
+            f" for {first.noisy_s:.1f} s, {when}"
+        )
+        names = tuple(one.name for one in channels if one in same)
+        several = len({one.unit for one in same}) > 1
+        found.append(Concern(Word.LOOK, names, words, "or" if several else "and"))
+    return found
+
+
+def _are_noisy_together(one: ChannelHealth, other: ChannelHealth) -> bool:
+    return (
+        one.measured_in == other.measured_in
+        and one.noisy_from_s <= other.noisy_from_s + other.noisy_s
+        and other.noisy_from_s <= one.noisy_from_s + one.noisy_s
+    )
+
+
 def _noisy(channels: Sequence[ChannelHealth]) -> list[Concern]:
-    """Return a concern for each channel that is much noisier than all other units."""
+    """Return a concern for each channel that is much noisier than all other units.
+
+    Channels with a spell of noise have a concern already.
+    """
     noise = np.array(
         [
             math.nan if one.residual_rms_rad_s is None else one.residual_rms_rad_s
@@ -314,4 +364,5 @@ def _noisy(channels: Sequence[ChannelHealth]) -> list[Concern]:
             f"is {noise[i] / beside:.0f} times as noisy as the other units",
         )
         for i, beside in much_noisier(noise, list(units.values()))
+        if not _is_noisy(channels[i])
     ]

@@ -46,6 +46,23 @@ MAX_START_BIAS = 4.0  # a start bias of more bias.turn_on_std is reported: one h
 
 
 @dataclass(frozen=True)
+class NoisySpell:
+    """A time in which a channel was much noisier than before, and than the other units."""
+
+    since: int  #: Stamp of its first sample, ns.
+    until: int  #: Stamp of its last sample so far, ns.
+    times: float  #: Largest noise over the expected or usual one, whichever is smaller.
+
+    @property
+    def seconds(self) -> float:
+        """Duration, s."""
+        return (self.until - self.since) / 1e9
+
+
+NEVER_NOISY = NoisySpell(0, 0, 0.0)
+
+
+@dataclass(frozen=True)
 class ChannelStatus:
     """Present state of one channel."""
 
@@ -71,6 +88,8 @@ class ChannelStatus:
     bias_std: float = math.nan
     noise: float = 0.0  #: Recent noise in noise_std, 0 if not measured.
     noisy: bool = False  #: Whether that is much, and more than the others show.
+    last_noisy: NoisySpell = NEVER_NOISY  #: Present or last spell of noise.
+    longest_noisy: NoisySpell = NEVER_NOISY  #: Longest spell of noise so far.
     unit: str = RATE.unit  #: rad/s of a gyro, m/s^2 of an accelerometer.
 
     @property
@@ -326,8 +345,15 @@ def _channel(
         bias_std=natural * float(core["remaining"][i]),
         noise=float(core["now"]["verdict"]["noise"][i]),
         noisy=is_in(i, int(core["now"]["noisy"])),
+        last_noisy=_spell(health["last_noisy"], i),
+        longest_noisy=_spell(health["longest_noisy"], i),
         unit=quantity.unit,
     )
+
+
+def _spell(spell: Any, i: int) -> NoisySpell:
+    since, until, times = (spell[name][i].item() for name in spell.dtype.names)
+    return NoisySpell(since, until, times)
 
 
 def _named(names: Sequence[str], marked: Mask) -> tuple[str, ...]:

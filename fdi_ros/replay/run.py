@@ -26,7 +26,6 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
 from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
-from fdi_ros.core.path import NOISY
 from fdi_ros.core.sources import source_of
 from fdi_ros.faults.fault import Fault, Injector, fault_from, parse_fault
 from fdi_ros.inspection.starting_config import assumed_config, starting_config_of
@@ -247,14 +246,13 @@ class Judge(Walk):
         levels = (status.protection_level, status.protection_level_after_loss)
         far = [one.name for one in status.channels if status.is_far(one)]
         channels = tuple(self._channels(end, status.channels))
-        degraded_by_name = {**self._degraded, **self._noisy(status.channels)}
         monitor = MonitorResult(
             channels=channels,
             units=tuple(self._units(status)),
             delays=tuple(
                 DelayResult(unit.name, late, std) for unit, late, std in delays
             ),
-            degraded=tuple(degraded_by_name.values()),
+            degraded=tuple(self._degraded.values()),
             bias=BiasResult(status.bias_state, tuple(status.bias), tuple(far)),
             note=status.note,
             protection_level=ProtectionLevel(
@@ -290,18 +288,6 @@ class Judge(Walk):
             share=1.0 - missing / max(1, evaluation.samples),
         )
 
-    def _noisy(self, statuses: Sequence[ChannelStatus]) -> dict[str, str]:
-        """Describe channels that were noisy for a second or more, by name."""
-        seconds = {
-            one.name: one.counts["noisy"] / (self.rate or math.inf) for one in statuses
-        }
-        return {
-            name: f"{name}: for {time:.1f} s, its noise was more than {NOISY:g} times its usual"
-            " noise, and larger than that of the other units"
-            for name, time in seconds.items()
-            if time >= LASTING
-        }
-
     def _channels(
         self, end: float, statuses: Sequence[ChannelStatus]
     ) -> Iterator[ChannelResult]:
@@ -330,6 +316,7 @@ class Judge(Walk):
                 reason = ""
             delivered = float(finite_values[i]) / samples
             unchecked = float(evaluation.unchecked[i])
+            noisy = status.longest_noisy
             yield ChannelResult(
                 name=status.name,
                 unit=units[i],
@@ -338,6 +325,9 @@ class Judge(Walk):
                 delivered=delivered,
                 spikes=status.counts["spikes"],
                 saturated_s=float(saturated[i]) / (self.rate or math.inf),
+                noisy_s=noisy.seconds,
+                noisy_from_s=evaluation.time(noisy.since) if noisy.since else 0.0,
+                noisy_times=noisy.times,
                 residual_rms_rad_s=evaluation.residual_rms[i],
                 doubt=_doubt_words(state, since, reason, end),
                 state=state,

@@ -4,6 +4,7 @@
 """What the operator is told: never more than is known, in words and figures that can be acted on."""
 
 import json
+import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.diagnostics import (
     DIAGNOSTICS,
+    PREFIX,
     InputStatus,
     Level,
     StatusLine,
@@ -30,6 +32,7 @@ from fdi_ros.monitor.diagnostics import (
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.receiver import SampleRateCheck
+from fdi_ros.monitor.recent import RecentHealth
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ChannelStatus
 from fdi_ros.system.text import plus_minus
@@ -388,20 +391,26 @@ def test_a_start_in_motion_is_followed_and_what_stays_unknown_is_said():
     assert float(value) == pytest.approx(drift[0], rel=1e-3)
 
 
-def test_a_noisy_channel_is_told_and_stays_in_use():
+def test_a_noisy_channel_is_reported_and_stays_in_use():
     pipeline = made()
-    block = flight(pipeline, 12)
-    block.z[600:, 1] += np.random.default_rng(2).normal(0, 8 * NOISE, 600)
+    block = flight(pipeline, 18)
+    block.z[1200:, 1] += np.random.default_rng(2).normal(0, 8 * NOISE, 600)
     assert not declarations(pipeline, pipeline.process(block))
-    lines, channel = told(pipeline), pipeline.status().channels[1]
+    status = pipeline.status()
+    channel = status.channels[1]
+    health = RecentHealth()
+    health.add(status, [], 0.0)
+    described = describe(status, concerns=health.concerns)
+    lines = {line.name.removeprefix(PREFIX): line for line in described}
     warned = {
         name: line.level for name, line in lines.items() if line.level != Level.OK
     }
     assert warned == {"monitor": Level.WARN, "imu_1.y": Level.WARN}
     assert 4 < channel.noise < 9
-    words = f"agrees with the others; noise {channel.noise:.1f} times noise_std, and larger than in the other units"
-    assert lines["imu_1.y"].message == words
-    assert "degraded: imu_1.y" in lines["monitor"].message
+    words = r"had noise [6-9]\.\d times as large as usual for [4-6]\.\d s, [4-6] s ago"
+    assert re.fullmatch(f"agrees with the others; {words}", lines["imu_1.y"].message)
+    assert re.search(f"imu_1.y {words}", lines["monitor"].message)
+    assert lines["monitor"].value("verdict") == "LOOK"
     assert channel.state == ChannelState.OK
 
 

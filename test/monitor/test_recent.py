@@ -3,6 +3,7 @@
 
 """Health of a running monitor: the verdict that a replay of the last minute would give."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -63,6 +64,21 @@ def test_spikes_are_named_for_a_minute_and_forgotten():
     assert at_30["imu_2.y"].level == Level.WARN
     *_, last = reports(block)
     assert last["monitor"].value("verdict") == "HEALTHY"
+
+
+def test_noise_is_reported_while_it_lasts_and_for_a_minute():
+    block = healthy(100)
+    random = np.random.default_rng(1)
+    block.z[10 * SECOND : 20 * SECOND, 4] += random.normal(0.0, 0.025, 10 * SECOND)
+    lines = [one["monitor"] for one in reports(block)]
+    verdicts = [one.value("verdict") for one in lines]
+    assert verdicts[:10] == ["HEALTHY"] * 10
+    assert verdicts[16:75] == ["LOOK"] * 59
+    assert verdicts[85:] == ["HEALTHY"] * 15
+    assert re.search(
+        r"imu_2.y had noise \d+ times as large as usual for \d+\.\d s, \d+ s ago",
+        lines[30].message,
+    )
 
 
 def test_a_slow_unit_is_named_with_both_rates_however_long_it_lasts():

@@ -116,6 +116,32 @@ def test_a_channel_is_noisy_only_if_it_is_so_above_the_others(others, noisy):
     assert found == ({"imu_2.y"} if noisy else set())
 
 
+@pytest.mark.parametrize("times", [5.0, 10.0, 30.0])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_channel_that_becomes_noisy_is_noisy_and_not_faulty(times, seed):
+    """From 10 s on, for ten seconds. A bias that the noise does not hide is still a fault."""
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    block = stream(pipeline.geometry, round(24 * RATE), seed=seed)
+    healthy = block.z.copy()
+    noise = np.random.default_rng(seed).normal(0.0, times * SIGMA, round(10 * RATE))
+    block.z[1000:2000, 4] += noise
+    output = pipeline.process(block)
+    assert not declarations(pipeline, output)
+    spell = pipeline.status().channels[4].longest_noisy
+    assert spell.seconds == pytest.approx(10.0, abs=3.0)
+    assert (spell.since - START) / 1e9 == pytest.approx(10.0, abs=3.0)
+    assert spell.times == pytest.approx(times, rel=0.5)
+    assert not any(
+        one.longest_noisy.seconds > 0.5
+        for one in pipeline.status().channels
+        if one.name != "imu_2.y"
+    )
+    healthy[1500:, 4] += noise[:900] + times * SIGMA
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    output = pipeline.process(Block(block.stamp, healthy))
+    assert declarations(pipeline, output)[-1] == ("imu_2.y", "FAULTY")
+
+
 @pytest.mark.parametrize(("rate", "hours"), [(1e-4, 1.0), (1e-3, 2.0), (0.1, 0.5)])
 def test_the_prior_of_a_fault_is_that_of_its_rate_over_the_exposure_in_hours(
     rate, hours
