@@ -76,7 +76,7 @@ def test_a_replay_says_what_the_verb_says(flight, config, root):
     for settings, one in ((root / "config" / "two_imus.yaml", fault), (config, FAULT)):
         assert fdi_ros.replay(flight, settings, [one], end=31.0).scores == same
     assert fdi_ros.Pipeline(str(root / "config" / "two_imus.yaml")).config == config
-    with pytest.raises(fdi_ros.FdiError, match="takes no sise, only"):
+    with pytest.raises(fdi_ros.FdiError, match="takes no 'sise', did you mean 'size'"):
         fdi_ros.replay(
             flight, config, [{"channel": "imu_2.y", "kind": "bias", "sise": 0.15}]
         )

@@ -142,9 +142,8 @@ def create_kind(name: str, /, **options: float | str | None) -> FaultKind:
     taken = kind.options()
     for option in given:
         if option not in taken:
-            raise FaultError(
-                f"fault {name} takes no {option}, only: {', '.join((*_KEYS, *taken))}"
-            )
+            hint = did_you_mean(option, (*_KEYS, *taken))
+            raise FaultError(f"fault {name} takes no {option!r}, {hint}")
     return kind(
         **{option: given.get(option, field.default) for option, field in taken.items()}
     )
@@ -157,7 +156,8 @@ def fault_from(items: Mapping[str, Any]) -> Fault:
     """
     for name in ("channel", "kind"):
         if not isinstance(items.get(name), str) or not items[name]:
-            raise FaultError(f"fault needs {name}, got: {dict(items)}")
+            words = " ".join(f"{key}={value}" for key, value in items.items())
+            raise FaultError(f"fault needs {name}=..., got: {words}")
     when = {name: items[name] for name in _KEYS[2:] if name in items}
     # A key of a YAML file may be anything.
     options = {str(name): value for name, value in items.items() if name not in _KEYS}
@@ -185,6 +185,9 @@ def key_values(text: str) -> dict[str, str]:
             raise FaultError(f"fault {text!r}: {word!r} is not of the form key=value")
         if name in items:
             raise FaultError(f"fault {text!r}: {name} is given twice")
+        if "," in value and "=" in value:
+            parts = " ".join(text.replace(",", " ").split())
+            raise FaultError(f"fault {text!r}: expected blanks between, {parts!r}")
         items[name] = value
     return items
 

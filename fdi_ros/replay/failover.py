@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -120,10 +121,14 @@ class FailoverReplay(Sink):
             if self._use[k] != in_use:
                 words = "in use again" if in_use else "out of use"
                 at = (now - BEGIN) / NS
-                self._done.append(
-                    f"{imu_name(k, self._channels)} {words} at {at:.1f} s"
-                )
+                self._done.append(f"{self._name(k)} {words} at {at:.1f} s")
             self._use[k] = in_use
+
+    def _name(self, imu: int) -> str:
+        """Return the autopilot's name of an IMU, from 0. A log may lack one between others."""
+        unit = self._channels[3 * imu].rpartition(".")[0]
+        numbered = re.fullmatch(r"imu_([1-9])", unit)
+        return f"IMU {numbered[1]}" if numbered else imu_name(imu, self._channels)
 
     @property
     def text(self) -> str:

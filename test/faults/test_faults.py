@@ -204,7 +204,7 @@ def test_the_cut_of_the_stream_changes_nothing(kinds, cuts, one_by_one):
         ("channel=imu_1.x kind=bias size=1 size=2", "size is given twice"),
         (
             "channel=imu_1.x kind=bias size=1 duty=0.5",
-            "takes no duty, only: channel, kind, start, stop, seed, size",
+            "takes no 'duty', expected one of: channel, kind, start, stop, seed, size",
         ),
         (
             "channel=imu_1.x kind=bias size=1 start=-1",
@@ -231,9 +231,14 @@ def test_the_cut_of_the_stream_changes_nothing(kinds, cuts, one_by_one):
         ({"channel": "imu_1.x", "kind": "bias", "size": 10**400}, "expected a number"),
         (
             {"channel": "imu_1.x", "kind": "bias", "size": 1, 5: 3},
-            "takes no 5, only: channel",
+            "takes no '5', expected one of: channel",
         ),
         ("channel=imu_1.x kind bias", "'kind' is not of the form key=value"),
+        (
+            "channel=imu_1.x,kind=bias, size=1",
+            "expected blanks between, 'channel=imu_1.x kind=bias size=1'",
+        ),
+        ("channel=imu_1.x kind=bias sise=1", "did you mean 'size'?"),
     ],
 )
 def test_a_wrong_fault_is_refused_in_one_line(text, words):

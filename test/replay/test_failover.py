@@ -27,11 +27,11 @@ def recorded(seconds=80.0, seed=1, interval=INTERVAL):
     return np.round(np.tile(rates, 3) + noise, 3)
 
 
-def orders(rates):
+def orders(rates, config=CONFIG):
     """Orders in a recording, by what is said before " at ", and their times, s."""
-    replay = FailoverReplay(NAMES, CONFIG.sample_rate)
+    replay = FailoverReplay(config.channel_names, config.sample_rate)
     stamp = 10**18 + INTERVAL * np.arange(len(rates))
-    Walk(Pipeline(CONFIG), [replay]).take(Block(stamp, rates))
+    Walk(Pipeline(config), [replay]).take(Block(stamp, rates))
     _, _, text = replay.text.partition(": ")
     pairs = [order.split(" at ") for order in text.split("; ")]
     return [(words, float(time.split()[0])) for words, time in pairs]
@@ -75,3 +75,12 @@ def test_vibration_near_a_multiple_of_50_hz_is_no_error_in_a_fast_recording(freq
 def test_failover_works_with_two_or_three_imus_of_three_channels():
     counts = [n for n in range(20) if is_possible(NAMES[:1] * n)]
     assert counts == [6, 9]
+
+
+def test_an_imu_keeps_its_number_where_the_log_lacks_another():
+    """IMU 1 and 3: the second unit of the recording is IMU 3 of the autopilot."""
+    changes = {"imus.topics": ["/imu_1", "/imu_3"], "imus.mounts": []}
+    config = CONFIG.replaced({**changes, "imus.names": ["imu_1", "imu_3"]})
+    rates = recorded()[:, :6]
+    rates[2000:2500, 3:6] = rates[1999, 3:6]
+    assert orders(rates, config)[0][0] == "IMU 3 out of use"
