@@ -33,11 +33,10 @@ QUANTILES = (
     0.97,
     0.99,
 )
-#: share of the time, or s, beyond every gyro's range: less is a shock or damage
-FAST_SHARE, FAST_TIME = (
-    0.01,
-    0.5,
-)
+#: time beyond every gyro's range, s: less is a shock or damage
+FAST_TIME = 0.5
+#: share of the recording beyond it, from which on values may be of any size
+FAST_SHARE = 0.01
 #: much of a recording, and all of a recording, as shares
 STILL, ALWAYS_STILL = 0.3, 0.95
 #: shortest rest, s: in a flight with vibration less may be chance
@@ -83,8 +82,9 @@ def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
     beyond = largest > largest_rate
     # Values in deg/s stay below twice the range of the gyro.
     lasting = beyond & (largest < 2.0 * DEGREES.factor * largest_rate)
-    seconds = report.segments.every * LENGTH / REST_BLOCKS * float(lasting.sum())
-    return bool(beyond.mean() > FAST_SHARE) or seconds > FAST_TIME
+    each = report.segments.every * LENGTH / REST_BLOCKS
+    often = beyond.mean() > FAST_SHARE
+    return bool(each * (beyond if often else lasting).sum() > FAST_TIME)
 
 
 class _Rest(NamedTuple):
