@@ -13,7 +13,7 @@ import numpy as np
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.compiling.compiled import MAX_CHANNELS
-from fdi_ros.config.config import Config, is_plain_name
+from fdi_ros.config.config import LEAST_WAIT, PARAMETERS, Config, is_plain_name
 from fdi_ros.core.sources import SOURCES
 from fdi_ros.errors import BagError
 from fdi_ros.inspection.degrees import in_degrees
@@ -37,6 +37,8 @@ _OF_A_MONITOR = {
     topic.name.rpartition("/")[2]
     for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
 }
+#: default of imus.timeout and of health.stale_timeout, s
+TIMEOUT = float(PARAMETERS["imus.timeout"].default)
 #: kinds of input, first those with stamps
 _PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
 NEEDED = ", or ".join(
@@ -100,7 +102,7 @@ def clocks_apart(reports: Sequence[TopicReport], beyond: float = 1.0) -> str:
         return ""
     return (
         f"stamps are of other clocks than those of {shown(first.topic.name)}: {', '.join(words)}; no instants can be"
-        " compared: let the clocks be one (PTP, chrony), or stamp on arrival"
+        " compared: synchronise the clocks (PTP, chrony), or stamp on arrival"
     )
 
 
@@ -118,17 +120,46 @@ def no_common_time(reports: Sequence[TopicReport]) -> str:
         for name, first, last in (spans[0], *apart)
     ]
     return (
-        f"no common time, by the stamps of their samples: {', '.join(words)}; let the"
-        " clocks be one, or give all stamps the same origin"
+        f"no common time, by the stamps of their samples: {', '.join(words)};"
+        " synchronise the clocks, or give all stamps the same origin"
     )
 
 
-def one_clock(reports: Sequence[TopicReport]) -> str:
-    """Return why the stamps of these topics cannot be compared, empty if they can."""
+def not_waited_for(reports: Sequence[TopicReport], timeout: float) -> str:
+    """Name the units whose stamps arrive too late or too early to be aligned, may be empty.
+
+    ``timeout``: time for which a silent unit is waited for, s.
+    """
+    first = reports[0]
+    wait = max(timeout, LEAST_WAIT * max(one.interval for one in reports))
+    words = [
+        f"{shown(one.topic.name)} {abs(one.ahead - first.ahead):.3g} s"
+        f" {'ahead' if one.ahead > first.ahead else 'behind'}"
+        for one in reports
+        if abs(one.ahead - first.ahead) > 1.1 * wait
+    ]
+    if not words:
+        return ""
+    return (
+        f"when messages arrive, stamps differ from those of {shown(first.topic.name)}:"
+        f" {', '.join(words)}; a unit is waited for {wait:.3g} s (imus.timeout)."
+        " Synchronise the clocks, or raise imus.timeout if messages take so long"
+    )
+
+
+def one_clock(reports: Sequence[TopicReport], timeout: float = TIMEOUT) -> str:
+    """Return why the stamps of these topics cannot be compared, empty if they can.
+
+    ``timeout``: time for which a silent unit is waited for, s.
+    """
     stamped = [one for one in reports if one.kind is not None and one.kind.stamped]
     if len(stamped) < 2:
         return ""
-    return clocks_apart(stamped) or no_common_time(stamped)
+    return (
+        clocks_apart(stamped)
+        or no_common_time(stamped)
+        or not_waited_for(stamped, timeout)
+    )
 
 
 def refuse_unfit(bag: Path, config: Config) -> list[TopicReport]:
@@ -139,7 +170,7 @@ def refuse_unfit(bag: Path, config: Config) -> list[TopicReport]:
     chosen = [one for one in inspect(bag, config.topics)[0] if one.channels]
     if words := in_degrees(chosen, max(FASTEST, *config.health.max_rate)):
         raise BagError(f"{bag} needs {words}; mend the driver")
-    if words := one_clock(chosen):
+    if words := one_clock(chosen, config.imus.timeout):
         raise BagError(f"{bag} needs one clock: {words}")
     return chosen
 

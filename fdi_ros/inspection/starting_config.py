@@ -25,7 +25,13 @@ from fdi_ros.config.config import (
 from fdi_ros.core.alignment import MAX_BRIDGE
 from fdi_ros.core.sources import input_of
 from fdi_ros.errors import BagError, ConfigError
-from fdi_ros.inspection.fitness import candidates, left_out, needs, one_clock
+from fdi_ros.inspection.fitness import (
+    TIMEOUT,
+    candidates,
+    left_out,
+    needs,
+    one_clock,
+)
 from fdi_ros.inspection.names import unit_names
 from fdi_ros.inspection.topics import (
     GAP,
@@ -49,8 +55,6 @@ from fdi_ros.system.text import listed, shown
 _LOG_TOPIC = re.compile(r"/imu_[0-9]{1,3}")
 #: time at the start over which the bias could be learned, s
 _REST = 3.0
-#: default of imus.timeout and of health.stale_timeout, s
-_TIMEOUT = float(PARAMETERS["imus.timeout"].default)
 #: message intervals in a timeout: so that alignment draws a line from one to the next
 _BRIDGED = 1.1 / MAX_BRIDGE
 
@@ -214,7 +218,7 @@ def starting_config(
     else:
         known |= _settings_of_array(chosen[0], urdf)
     if silent := _longer(chosen, GAP, 60.0):
-        known["health.stale_timeout"] = silent, f"the default is {_TIMEOUT:g} s"
+        known["health.stale_timeout"] = silent, f"the default is {TIMEOUT:g} s"
     return StartingConfig(
         shown(bag.name),
         {name: value for name, (value, _) in known.items()},
@@ -283,7 +287,7 @@ def _settings_of_units(
         slowest = min(report.rate for report in chosen)
         none = "none would be aligned between two"
         words = (
-            f"messages come at {slowest:.3g} Hz: with the default {_TIMEOUT:g} s {none}"
+            f"messages come at {slowest:.3g} Hz: with the default {TIMEOUT:g} s {none}"
         )
         known["imus.timeout"] = timeout, words
     return known, mounted
@@ -338,7 +342,7 @@ def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> flo
         if one.intervals
     ]
     needed = max([*(intervals * report.interval for report in chosen), *nearly_all])
-    return min(_rounded_up(needed), most) if needed > _TIMEOUT else 0.0
+    return min(_rounded_up(needed), most) if needed > TIMEOUT else 0.0
 
 
 def _starts_at_rest(report: TopicReport) -> bool:

@@ -236,6 +236,38 @@ def test_stamps_of_other_clocks_are_said_by_replay_itself(
     assert f"/imu_1/data {words}" in said
 
 
+@pytest.mark.parametrize("late", [0.15, -0.4, 0.9])
+def test_stamps_beyond_the_time_that_is_waited_are_no_lost_data(
+    late, tmp_path, fdi, refused
+):
+    """A unit that delivers everything must not be called silent."""
+    time, rates = drive()
+    offsets = (0, round(late * 1e9), 0)
+    path = write_bag(tmp_path / "bag.mcap", time, rates, offsets)
+    side = "ahead" if late > 0 else "behind"
+    said = f"/imu_1/data {abs(late):g} s {side}; a unit is waited for 0.1 s"
+    assert said in refused("replay", path)
+    assert said in fdi("inspect", path).out
+
+
+def test_a_unit_whose_messages_are_late_is_waited_for_as_asked(tmp_path, fdi):
+    time, rates = drive()
+    config = tmp_path / "late.yaml"
+    table = write_csv(tmp_path / "a.csv", time, rates)
+    assert fdi("inspect", table, "--output", config).code == 0
+    text = config.read_text()
+    messages = [
+        (f"/imu_{k}", int(at) + (k == 1) * 300_000_000, imu(int(at), rate))
+        for k, unit in enumerate(rates)
+        for at, rate in zip(START + np.round(time * 1e9).astype(int), unit, strict=True)
+    ]
+    messages.sort(key=lambda one: one[1])
+    write_mcap(tmp_path / "late.mcap", messages)
+    config.write_text(text.replace("imus:", "imus:\n      timeout: 0.5", 1))
+    said = fdi("replay", tmp_path / "late.mcap", "--config", config)
+    assert said.out.startswith("HEALTHY: "), said
+
+
 def test_all_stamps_since_boot_are_as_good_as_dates(tmp_path, fdi):
     time, rates = drive()
     offsets = (-START + 10**9,) * 3
