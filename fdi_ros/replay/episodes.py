@@ -10,6 +10,7 @@ are the same.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, Protocol
@@ -36,6 +37,9 @@ def pieces(stamp: NDArray[np.int64], longest: float = HOLE) -> list[slice]:
     return [slice(begin, end) for begin, end in pairwise(edges) if end > begin]
 
 
+ACROSS_HALVES = 5.0
+"""Largest time between the first signs of a fault of a unit in its gyros and in its
+accelerometers, s."""
 DECLARED = ("FAULTY", "AMBIGUOUS")
 """States of an episode with a declared fault. The other state, STALE, means no data."""
 Course = Literal[
@@ -166,6 +170,9 @@ class Episode:
     """Unit of sizes and standard deviations: rad/s, or m/s^2 for accelerometers."""
     injected: tuple[str, ...] = ()
     """Injected faults that explain the episode."""
+    halves: tuple[Episode, ...] = ()
+    """Episodes of gyros and of accelerometers that are one fault of their unit. Empty: a fault of one
+    kind of sensor. The halves have the candidates."""
 
     @property
     def duration_s(self) -> float:
@@ -228,9 +235,80 @@ NOTHING_HAPPENED = Story((), ())
 """Story of a recording without samples."""
 
 
+def join_halves(
+    episodes: Sequence[Episode], unit_of: Mapping[str, str]
+) -> list[Episode]:
+    """Join episodes of the gyros and of the accelerometers of a unit that begin together.
+
+    A unit that is loose, frozen, turned, silent or set to a wrong range shows in both, with
+    two channels of each at least. ``unit_of``: unit of each channel.
+    """
+    joined = []
+    left = list(episodes)
+    while left:
+        first = left[0]
+        units = {unit_of[name] for name in first.channels}
+        parts = [
+            one
+            for one in left
+            if len(units) == 1
+            and all(units)
+            and _is_of_unit(one, first, unit_of, units)
+        ]
+        shown = {one.measured_in for one in parts if len(one.channels) > 1}
+        if len(shown) < len(HALVES):
+            parts = [first]
+        left = [one for one in left if one not in parts]
+        joined.append(first if len(parts) == 1 else _whole(parts, *units))
+    return joined
+
+
+def _is_of_unit(
+    one: Episode, first: Episode, unit_of: Mapping[str, str], units: set[str]
+) -> bool:
+    """Whether an episode belongs to the same fault of the unit as the first one."""
+    return (
+        {unit_of[name] for name in one.channels} == units
+        and (one.stretch, one.declares) == (first.stretch, first.declares)
+        and one.start_s <= min(first.end_s, first.start_s + ACROSS_HALVES)
+    )
+
+
+def _whole(parts: Sequence[Episode], unit: str) -> Episode:
+    """Return the episode of a unit that its gyros and its accelerometers show."""
+    by_half = [[one for one in parts if one.measured_in == name] for name in HALVES]
+    channels = dict.fromkeys(
+        name for half in by_half for one in half for name in one.channels
+    )
+    steps = [step for one in parts for step in one.steps]
+    whole = replace(
+        parts[0],
+        channels=tuple(channels),
+        who=unit,
+        start_s=min(one.start_s for one in parts),
+        since_s=max(min(one.start_s for one in half) for half in by_half),
+        end_s=max(one.end_s for one in parts),
+        stands=any(one.stands for one in parts),
+        steps=tuple(sorted(steps, key=lambda step: step.at_s)),
+        candidates=(),
+        apart=None,
+    )
+    if whole.declares:
+        named = any(one.state == "FAULTY" for one in parts)
+        whole = replace(
+            whole,
+            state="FAULTY" if named else "AMBIGUOUS",
+            who=f"{unit} ({' and '.join(HALVES.values())})",
+            halves=tuple(parts),
+        )
+    return replace(whole, words=episode_words(whole))
+
+
 # In words
 
 
+HALVES = {RADIANS.name: "gyros", FORCES.name: "accelerometers"}
+"""Kinds of sensors of a unit, by the unit of their figures."""
 MOST_TOLD = 5
 """Episodes in the summary. The tables have all of them."""
 TOO_SMALL = "too small to measure"
@@ -278,6 +356,9 @@ def unit_for(one: _Measured, unit: Unit) -> Unit:
 
 def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
     """Describe an episode in one sentence, without a full stop."""
+    if one.halves:
+        parts = "; ".join(episode_words(half, unit) for half in one.halves)
+        return f"{one.who} {one.state} from {one.since_s:.3f} s: {parts}"
     unit = unit_for(one, unit)
     until = "" if one.stands else f" to {one.end_s:.3f} s"
     about = _about(one, unit)
@@ -364,6 +445,14 @@ def detail_words(
 
     ``scored``: faults were injected, and the lines name those that explain the episode.
     """
+    if one.halves:
+        return [
+            (f"{HALVES[half.measured_in]}: {title}", words)
+            for half in one.halves
+            for title, words in detail_words(
+                replace(half, injected=one.injected), unit, scored
+            )
+        ]
     unit = unit_for(one, unit)
     injected = (
         [("injected faults", ", ".join(one.injected) or "nothing")] if scored else []

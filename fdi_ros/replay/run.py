@@ -35,7 +35,7 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.soundness import RateHealth, UnitHealth
 from fdi_ros.monitor.status import ChannelStatus, Status
-from fdi_ros.replay.episodes import GAP, Story, pieces
+from fdi_ros.replay.episodes import GAP, Story, join_halves, pieces
 from fdi_ros.replay.health import Deliveries, Values, with_context, with_delivery
 from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
@@ -261,7 +261,14 @@ class Judge(Walk):
             us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),
             rate=self._rate_health(),
         )
-        story = _joined([one.story(end) for one in self._recorders])
+        units = {
+            name: unit
+            for half in self.pipeline.halves
+            for name, unit in zip(
+                half.geometry.channel_names, half.geometry.unit_of, strict=True
+            )
+        }
+        story = _joined([one.story(end) for one in self._recorders], units)
         episodes = []
         for one in story.episodes:
             known = [
@@ -378,12 +385,17 @@ class Judge(Walk):
         return float(1e9 / step[np.searchsorted(np.cumsum(count), count.sum() / 2)])
 
 
-def _joined(stories: Sequence[Story]) -> Story:
-    """Merge the stories of gyros and accelerometers, with the stretches of the gyros."""
+def _joined(stories: Sequence[Story], unit_of: Mapping[str, str]) -> Story:
+    """Merge the stories of gyros and accelerometers, with the stretches of the gyros.
+
+    ``unit_of``: unit of each channel.
+    """
     episodes = [one for story in stories for one in story.episodes]
     episodes.sort(key=lambda one: (one.start_s, one.since_s))
     return Story(
-        stories[0].stretches, tuple(episodes), sum(story.more for story in stories)
+        stories[0].stretches,
+        tuple(join_halves(episodes, unit_of)),
+        sum(story.more for story in stories),
     )
 
 

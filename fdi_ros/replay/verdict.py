@@ -161,6 +161,8 @@ def _faulty_sentences(faulty: Sequence[Episode], unit: Unit) -> str:
 
 def _who(one: Episode) -> str:
     """Return the channels as spoken: ``imu_0, x and y,``."""
+    if one.halves:
+        return one.who
     parts = [name.rpartition(".") for name in one.channels]
     units = {unit for unit, _, _ in parts}
     if one.state == "AMBIGUOUS" and len(parts) > 1:

@@ -105,19 +105,76 @@ def test_nothing_is_declared_in_a_healthy_simulated_flight_with_vibration():
     assert all(one.checked > 0.9 for one in summary.monitor.channels)
 
 
+def recorded(path, stamp, rates, forces):
+    """Write rates and forces (N, 9) of three units to a bag."""
+    messages = [
+        (topic, stamp + 1000 * k, imu(stamp, rate, force=tuple(force)))
+        for stamp, all_rates, all_forces in zip(
+            stamp.tolist(), rates, forces, strict=True
+        )
+        for k, (topic, rate, force) in enumerate(
+            zip(
+                settings().topics,
+                np.split(all_rates, 3),
+                np.split(all_forces, 3),
+                strict=True,
+            )
+        )
+    ]
+    return write_bag(path, messages)
+
+
+def with_wrong_range(rates, forces):
+    for values in (rates, forces):
+        values[600:, 6:] *= 2.0
+
+
+def turned(rates, forces):
+    for values in (rates, forces):
+        values[600:, 6:] = values[600:, [7, 6, 8]]
+
+
+def frozen(rates, forces):
+    for values in (rates, forces):
+        values[600:, 6:] = values[600, 6:]
+
+
+def wrong_about_one_axis_each(rates, forces):
+    rates[600:, 8] += 0.5
+    forces[600:, 8] += 5.0
+
+
+@pytest.mark.parametrize(
+    ("fault", "count"),
+    [
+        (with_wrong_range, 1),
+        (turned, 1),
+        (frozen, 1),
+        (wrong_about_one_axis_each, 2),
+    ],
+)
+def test_a_fault_of_a_unit_is_one_episode_of_gyros_and_accelerometers(
+    fault, count, tmp_path
+):
+    block, _ = flight(1400)
+    rates = block.z.copy()
+    forces = block.acceleration.z.copy()
+    fault(rates, forces)
+    path = recorded(tmp_path / "flight", block.stamp, rates, forces)
+    summary = replay(path, settings())
+    assert len(summary.story.episodes) == count
+    assert ("imu_3 (gyros and accelerometers)" in summary.verdict.sentence) == (
+        count == 1
+    )
+    assert summary.verdict.sentence.count("imu_3") == count
+    assert all(name.startswith("imu_3.") for name in summary.verdict.channels)
+    assert "m/s^2" in summary_text(summary)
+
+
 def test_a_fault_injected_into_an_accelerometer_is_told_of_in_its_unit(tmp_path):
     block, _ = flight(800)
     config = settings()
-    messages = [
-        (topic, stamp + 1000 * k, imu(stamp, rate, force=tuple(force)))
-        for stamp, rates, forces in zip(
-            block.stamp.tolist(), block.z, block.acceleration.z, strict=True
-        )
-        for k, (topic, rate, force) in enumerate(
-            zip(config.topics, np.split(rates, 3), np.split(forces, 3), strict=True)
-        )
-    ]
-    path = write_bag(tmp_path / "flight", messages)
+    path = recorded(tmp_path / "flight", block.stamp, block.z, block.acceleration.z)
     fault = "channel=imu_2.accel_z kind=bias size=2 start=4"
     summary = replay(path, config, [fault])
     (outcome,) = summary.scores.faults
@@ -130,6 +187,8 @@ def test_a_fault_injected_into_an_accelerometer_is_told_of_in_its_unit(tmp_path)
     assert "rad/s" not in episode.words
     lost = replay(path, config, ["channel=imu_3 kind=triad_loss start=4"])
     assert len(lost.scores.faults[0].channels) == 6
+    (silent,) = lost.story.episodes
+    assert (silent.who, len(silent.channels)) == ("imu_3", 6)
 
 
 def test_arrays_of_a_recording_are_judged_as_their_block_is(tmp_path):
