@@ -135,8 +135,9 @@ class Track:
     fast: int = 0
     #: us between these and the ones before
     fast_time: int = 0
+    #: stamp of the first sample, us
     first: int = 0
-    #: stamps of the first and the last, us
+    #: stamp of the last sample, us
     last: int = 0
     #: latest stamp so far, us, None at the start
     come: int | None = None
@@ -170,7 +171,7 @@ class Track:
         first = int(come[0]) if self.come is None else self.come
         before = np.maximum.accumulate(np.append(first, come[:-1]))
         self.come = max(first, int(come.max()))
-        # Nor does a log go on years later: there its times begin to be dates, or no longer are.
+        # A jump ahead by years is a second log too: its times became dates, or ceased.
         behind = (come < before - _MAX_STEP_BACK) | (come - before > LOG_SPAN)
         return int(samples["end"][np.argmax(behind)]) if behind.any() else 0
 

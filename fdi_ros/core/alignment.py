@@ -617,12 +617,16 @@ class Alignment:
 
     @property
     def lag(self) -> list[int]:
-        """By how much the last message of each unit was older than the newest of all, ns."""
+        """By how much the last message of each unit was behind the common time, ns."""
         return list(self.rows["units"]["lag"][0, : self.units].tolist())
 
     @property
     def shift(self) -> int:
-        """Offset added to the stamps of samples, ns. 0 until all clocks were set back."""
+        """Offset added to the stamps of samples, ns.
+
+        0 before the first move of the time base. Chosen anew at each move, so that
+        later samples are newer than all earlier messages.
+        """
         return int(self.rows["shift"][0])
 
     def _aligned(self, unit: Int, stamp: Int, values: Array) -> NDArray[Any]:

@@ -136,7 +136,8 @@ def confirm(decision: Decision, settings: PathSettings) -> tuple[int, int]:
     channel, and at least half as many of these alarms isolate their suspects. If the
     alarms suffice but isolate no channel, the channels that at least half of them
     suspected form the undecided set. The same holds if all samples of the window have
-    alarms that disagree.
+    alarms that disagree; if no channel is in half of `alarms` of them, all suspects
+    form the set.
     """
     half = (settings.alarms + 1) // 2
     enough = at_least(decision, settings, COUNTED, settings.alarms)

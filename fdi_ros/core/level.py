@@ -246,9 +246,10 @@ def cover_rival(core: Core, rival: Rival) -> None:
 def update_level(core: Core, subsets: NDArray[Any]) -> None:
     """Update the protection level of the fused rate in this sample.
 
-    The level is a sum of three parts: the level of the rate with its expected weights,
-    the difference between that rate and the fused rate, and a bound on the errors that
-    all channels share, which no residual shows. The level is infinite without a fused
+    The level is a sum of five parts: the level of the rate with its expected weights,
+    the difference between that rate and the fused rate, a bound on the errors that all
+    channels share, which no residual shows, and the changes of the rate up to the
+    stated instant and between the units. The level is infinite without a fused
     rate, while a doubtful channel is fused for want of others, and where the separation
     test fails. If the level of the fused channels has not been calculated yet,
     ``core.wanted`` is set to their mask.

@@ -157,7 +157,10 @@ def process(
     fused: Bytes,
     integrity: Bytes,
 ) -> int:
-    """Process the next complete sample. Return `WORKED` and other bits, or 0 if none is ready.
+    """Process the next complete sample, and return bits of the result.
+
+    `WORKED` and other bits; `SUPPLY` and `MORE` if a detector must be prepared first; 0
+    if no sample is ready.
 
     Parameters
     ----------

@@ -187,9 +187,7 @@ class Estimate:
     bias: Channels  # in addition to the bias from the start, rad/s
     bias_std: Channels  # standard deviation of `bias`, rad/s
     late: Units  # certain delay of the stamps of each unit, s, which `restamp` corrects
-    behind: (
-        Real  # time from the values to the stamp, if the earliest unit is in time, s
-    )
+    behind: Real  # time from measurement to stamp, if the earliest unit is not late, s
     spread: Real  # largest delay between units, s
     spikes: Counts  # short outliers of each channel so far, left out of the rate
 
@@ -375,7 +373,7 @@ class Bias:
 
     given: Flag  # by the settings
     value: Channels  # subtracted from each channel, rad/s
-    known: Mask  # channels with a valid bias; others were lost, silent or restless
+    known: Mask  # channels with a valid bias; the others were silent or restless
     duration: Whole  # of the average, ns
     centre: Channels  # expected average, rad/s
     max_rate: Real  # mean at rest, rad/s
@@ -574,9 +572,7 @@ class PathSettings:
     places: Counts  # index of each accelerometer in a sample
     arms: Axes  # position of each accelerometer from the first unit, m
     lever: Flag  # a position is not zero
-    position_variance: (
-        Channels  # of what is unknown of each position, along an axis, m^2
-    )
+    position_variance: Channels  # of each accelerometer's position, along one axis, m^2
     sensors: Sensors
     largest_noise: Real  # noise_std of the noisiest channel, rad/s
     units: Whole
@@ -612,11 +608,14 @@ class PathSettings:
 
 @record
 class Current:
-    """Figures of the present sample. Only `waiting` refers to the previous one."""
+    """Figures of the present sample.
+
+    `waiting` stands between two calls of `step` with the same sample.
+    """
 
     repeated: Mask  # channels of units that repeat old values in this sample
     all_repeat: Flag  # all channels repeat their values
-    noisy: Mask  # channels much noisier than expected and than the others
+    noisy: Mask  # much noisier than expected or usual, and than the other units
     waiting: Flag  # `prepare_sample` is done, and the detector follows
     learned_from: Flag  # the sample served only to learn the bias
     aligned: Channels  # values at the instant of the sample, rad/s

@@ -70,7 +70,7 @@ STANDS = 0.6
 """Log odds that open a case, as a share of the logarithm of the run length. The sums need
 the whole logarithm, but here every uncertainty counts in full."""
 ENDS = 2.0  # log odds of the likeliest hypothesis below which a case ends: hardly better than none
-# Channels are named again when the time since the onset has grown by one part in this.
+# Channels are named again when the time that is explained has grown by 1 / RENAME.
 RENAME = 16
 SETTLED, SETTLED_AMONG_FEW = 0.2, 0.5
 SETTLED_TOGETHER = 2.0 * SETTLED_AMONG_FEW
@@ -107,8 +107,8 @@ LONGEST_WAIT = 0.5
 without the refused case."""
 DRIFT_TIMES = 4
 LONGEST_DRIFT = WARMS * (1 << DRIFT_TIMES)
-"""Longest time over which a slow drift is searched, s: 480, the age of the oldest kept
-states. The search halves the time `DRIFT_TIMES` times."""
+"""Longest time over which a slow drift is searched, s: 480. The search tries
+`DRIFT_TIMES` times, each half as long as the one before: 480, 240, 120 and 60."""
 # time after a gap before the mean starts anew, s: equal to the time that a name must stand
 LEAST_RETURN = 0.2
 # largest move of all biases at once, rad/s: motors that start move them by some 0.005
@@ -414,7 +414,7 @@ def name_channels(params: Constants, state: State) -> None:
         # Moves in the hole are in the variances of the biases.
         case.healthy_move = 0.0
     elif not case.isolated:
-        # A fault that is named stays so, as it goes on.
+        # Once a channel is named, the allowed move stays, and so does the name.
         passed = min(size * params.period / MOVE_TIME, 1.0)
         case.healthy_move = params.bias_move * passed
     if size * params.period > LONG_TIME:
@@ -488,10 +488,12 @@ def mean_step(scale: Scale, i: int, steps: int, without: int) -> float:
 
 @compiled
 def gives_up(params: Constants, state: State, seconds: float) -> bool:
-    """Give a case up that no hypothesis has explained for long, counted every so many s; return whether it is.
+    """Give up a case that no hypothesis explains; return whether that was done.
 
-    The errors of the sensors are as uncertain as at the start then, and their biases by
-    what the channels differ.
+    It must have been unexplained for `UNSOLVED`.
+
+    ``seconds`` is the time since the last call. Afterwards all sensor errors are as
+    uncertain as at the start, and the biases by as much as the channels differ.
     """
     kf = state.estimator
     case = state.case
@@ -505,7 +507,7 @@ def gives_up(params: Constants, state: State, seconds: float) -> bool:
     move_biases(params, kf, std, 0.0)
     for r in range(params.sensors.n, layout.count):
         kf.states.p[r, r] += layout.prior[r] * layout.prior[r]
-    # Before the states were as sure, they were wrong.
+    # The snapshots are wrong too, and too certain: discard them.
     for tier in range(TIERS):
         kf.taken[tier] = 0
     kf.noise.lived[kf.noise.regime] = 0.0

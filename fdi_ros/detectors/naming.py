@@ -72,8 +72,8 @@ FIT, FIT_PER_CHECK = 6.0, 2.5
 """Largest chi-square of the unexplained rest: a constant, and a part for each degree of
 freedom. Noise alone exceeds the limit at most once in 240 cases."""
 SET_MARGIN = 5.0
-"""A set may miss one of several faulty channels with this many times the risk of a wrong
-name. A set that misses all faulty channels is far less likely."""
+"""Accepted risk that a set misses one of several faulty channels, as a multiple of the
+risk of a wrong name. The risk that it misses all of them is far smaller."""
 UNEXPLAINED_SHARE = 0.2
 """All biases have moved where the best hypothesis of a fault leaves at least this share of
 the chi-square. A fault of one or two channels leaves almost nothing, whatever its size."""

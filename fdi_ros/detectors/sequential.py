@@ -104,9 +104,8 @@ LEAST_SCALE, LEAST_TIMING, LEAST_NONLINEARITY = 1e-3, 3e-4, 3e-4
 """Smallest believable standard deviations of any channel, even a calibrated one: scale
 error, sampling instant in s, and nonlinearity."""
 FEWEST_BLOCKS = 3  # consecutive blocks from which the angular acceleration follows
-SHORT = (
-    1.0 - 1e-9
-)  # statistic over threshold where the sums reach the threshold without an alarm
+# Largest ratio of statistic to threshold that is published while there is no alarm.
+SHORT = 1.0 - 1e-9
 
 
 @compiled
@@ -427,8 +426,9 @@ class Sequential(Detector):
     smallest set of hypotheses that holds the truth with probability `confidence`. The
     fault is `isolated` if these hypotheses have a channel in common and the best one
     leaves only noise. `Verdict.statistic` is the logarithm of one plus the mean of all
-    sums: below the threshold without an alarm, at or above the threshold with one, and 0
-    while no evidence counts. docs/methods.md has the details.
+    sums: below the threshold without an alarm, at or above the threshold with one, 0
+    while no evidence counts, and NaN while no channel is judged. docs/methods.md has
+    the details.
 
     Parameters
     ----------

@@ -36,11 +36,12 @@ from fdi_ros.estimator.noise import MOTION, REST
 from fdi_ros.estimator.shared_noise import UNEQUAL
 
 TURNING = 20.0
-"""Squared angular acceleration over its noise variance from which it counts as motion. Noise taken
-for motion would teach delays of zero."""
-# share of a channel's own error in its residual, below which no method judges it
+"""Ratio of the squared angular acceleration to its noise variance from which the body
+turns. If noise passed for motion, delays of zero would be learned."""
+# Smallest share of a channel's error in its residual. Below it no method judges the
+# channel.
 LEAST_REDUNDANCY = 1e-3
-PEAK = 0.8  # decay of a motion peak per block: gone after half a second
+PEAK = 0.8  # factor per block on the peaks of motion: they fade within half a second
 
 
 @compiled
@@ -55,7 +56,7 @@ def update_acceleration(params: Constants, kf: Estimator) -> float:
     behind = kf.times[1] - kf.times[2]
     span = kf.ended[1] - kf.ended[2]
     whole = kf.times[0] - kf.times[2]
-    # Second-order differences of means whose samples may be apart by more than others.
+    # Weights of the two differences, exact to second order for unequal distances.
     first = behind / (ahead * whole)
     last = ahead / (behind * whole)
     worst = single = apart = 0.0
@@ -176,11 +177,11 @@ def judge_block(params: Constants, kf: Estimator) -> float:
 
 @compiled
 def unlearnable(error: float, inside: float, square: float) -> float:
-    """Variance of a multiplicative error that no number of samples removes, in units of one.
+    """Return the variance of a scale error that no number of samples removes.
 
-    Units see vibration differently. Of the error variance of a channel (``error``),
-    ``inside`` may be part of the signal itself (mean square ``square``). Vibration then
-    looks like a constant share of the signal.
+    ``error`` is the error variance of a channel, ``square`` the mean square of the
+    signal, and ``inside`` the part of ``square`` that may be vibration. Units see
+    vibration differently, so vibration looks like a scale error of the signal.
     """
     return error / max(square, 1e-12) * min(1.0, inside / max(square, 1e-12))
 
@@ -229,9 +230,9 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
         inside = max(inside, error / (UNEQUAL * UNEQUAL))
         least = unlearnable(error, inside, along)
         keep_least_variance(layout, i, SPEED, least, kf.least_variance)
-        # Variance of a difference of two blocks, with the root of the unknown slow
-        # noise: the full factor would
-        # stop delays from being learned in the first seconds of motion.
+        # Noise variance of a block as above, but with the square root of the unknown
+        # slow noise: with the full factor no delay is learned in the first seconds of
+        # motion.
         error = (
             noise.now.block[i]
             * noise.longest[i]

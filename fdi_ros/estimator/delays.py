@@ -19,7 +19,10 @@ LONGEST_DELAY = (
 
 @compiled
 def update_time_offsets(params: Constants, kf: Estimator) -> None:
-    """Find how far corrected values lie before their stamp if the earliest unit is in time, and the spread.
+    """Update ``kf.behind`` and ``kf.spread``.
+
+    ``behind`` is the time from the measurement of the corrected values to their stamp,
+    if the earliest unit is not late. ``spread`` is the largest delay between two units.
 
     `restamp` brings all units to the instant of the latest unit. The delay states then
     refer to the first unit.

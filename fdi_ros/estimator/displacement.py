@@ -5,9 +5,10 @@
 
 An accelerometer of axis h at r from the first unit measures ``r . v`` more, with ``v = h
 x alpha + omega (omega . h) - omega^2 h``. The channels of one unit have one r, so their
-errors are correlated. In the mean over some time, v is a mean as well: alpha is the
-change of the rate over that time, and a turn to and fro leaves little of it. Single
-samples have the largest variance of late, because their alpha is mostly noise.
+errors are correlated. The mean of a channel contains the mean of v, in which alpha is
+the change of the rate over that time: little remains of a turn back and forth. For
+single samples alpha is mostly noise, so the recent peak of the variance is used
+instead.
 """
 
 from __future__ import annotations

@@ -59,8 +59,8 @@ from fdi_ros.model.samples import Array
 BLOCK_TIME = 0.04  # s: four samples at 100 Hz, short against the motion of a vehicle
 LONG_TIME = 2.0
 """Longest time scale of evidence, s. Under suspicion the states are held for at most
-this time, as their errors would become common to all blocks. Of a longer time since an
-onset only the last half is explained."""
+this time: held longer, their errors would be the same in all blocks. If an onset is
+older than this, only the second half of the time since then is explained."""
 BEGINS = 16.0
 """Motion begins where the squared rate exceeds this many of its variances, and
 `THREE_SIGMA` times the part that no rate explains: a fault looks like motion too."""
@@ -74,13 +74,13 @@ SAMPLES, BLOCKS, COARSE = (
     1024,
     512,
 )  # totals kept: of the last samples, of blocks, and of every `STRIDE`th block
-LEAST_SHARE = (
-    0.02  # least share of noise in the variance of a statistic: below is rounding
-)
-# share of a channel's own variance in its parity below which a fault does not show
+# Smallest share of noise in the variance of a statistic. A smaller share is rounding.
+LEAST_SHARE = 0.02
+# Smallest share of a channel's variance that must remain in its residual. With less, no
+# residual shows a fault of the channel.
 SENSITIVE = 1e-6
-# least information over the information with all errors known: faults may be ten times
-# larger
+# Smallest information about a channel, as a share of the information with all sensor
+# errors known. At this value a fault must be ten times as large to show.
 CHECKABLE = 0.01
 Block = Annotated[NDArray[np.float64], "f8", (2, MAX_CHANNELS)]
 Rates = Annotated[NDArray[np.float64], "f8", (3, 3)]
@@ -88,12 +88,11 @@ Window = Annotated[NDArray[np.float64], "f8", (REST_BLOCKS, 3)]
 Sets = Annotated[NDArray[np.uint8], "u1", (1 << MAX_CHANNELS,)]
 
 
-LEAST_GAP = (
-    0.2  # s without a value of a channel that are a gap, and no loss of single messages
-)
-SLOW_TURN = (
-    1e-4  # (rad/s)^2: below 0.6 deg/s the uncertainty does not grow with the motion
-)
+# Time without a value of a channel that counts as a gap, s. A lost message is none.
+LEAST_GAP = 0.2
+# Squared rate, (rad/s)^2, up to which the state uncertainty hardly grows with the
+# motion: 0.6 deg/s.
+SLOW_TURN = 1e-4
 
 
 @record
@@ -255,7 +254,7 @@ class Estimator:
     unresolved: Vector
     turned: Matrix
     displacement: Axes
-    allowed: Channels  # that much of it is in the covariance of samples
+    allowed: Channels  # part of `displaced` that the covariance of samples contains
     rest_rates: Window  # of the last blocks, rad/s
     rest_noise: Vector  # variance of the rate of a block, (rad/s)^2
     rest_bias_variance: Vector  # variance of the rate by the biases, (rad/s)^2
@@ -369,7 +368,10 @@ def watch_for_motion(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def usual_chi(free: float) -> float:
-    """Largest usual chi-square with ``free`` degrees of freedom: four standard deviations above the mean."""
+    """Return the largest usual chi-square with ``free`` degrees of freedom, at least 1.
+
+    This is the mean plus four standard deviations, plus 4.
+    """
     return max(free, 1.0) + 4.0 * math.sqrt(2.0 * max(free, 1.0)) + 4.0
 
 
@@ -445,7 +447,7 @@ def add_to_total(kf: Estimator, i: int, value: float) -> None:
     if kf.far_samples == 0:
         kf.spike_sum[i] = 0.0
     elif kf.spiked == 0:
-        # It lasts, and is no spike.
+        # The deviation lasts, so it was no spike: add it after all.
         kf.total.values[i] += kf.spike_sum[i]
         kf.spike_sum[i] = 0.0
     else:
@@ -524,7 +526,10 @@ def close_block(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def total_before(kf: Estimator, sample: int, out: Total, n: int) -> None:
-    """Find the sums up to the last kept moment before a sample, or nearly."""
+    """Copy the sums at the last stored moment before a sample to ``out``.
+
+    If all stored moments are later, the oldest one is copied.
+    """
     if kf.samples - sample < SAMPLES - 1:
         copy_total(n, kf.last_samples[(sample - 1) % SAMPLES], out)
         return

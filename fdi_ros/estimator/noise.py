@@ -43,30 +43,32 @@ LAGS = 3  # shorter lags of 0.25 s means, beside one second: a 1 Hz beat repeats
 THREE_SIGMA, FAR = 9.0, 100.0
 """Squares of three standard deviations, which one of 370 normal values exceeds, and of
 ten, which none does."""
-# factor on the half-second variance, below its scatter; used where above the learned
-# variance
+# The half-second variance counts with this factor if that exceeds the learned variance.
+# The factor allows for its scatter.
 BURST = 0.75
-QUIETEST = 0.1  # least variance over the one expected, so that returning noise is not a surprise
-QUIETEST_BLOCK = (
-    0.03  # the same for blocks: means of quantised values at rest scatter less
-)
-LOUDEST = 1e4  # largest block variance over the one expected: 100 times the noise hides any fault
-UNKNOWN = 16.0  # long-time variance over block variance assumed before any is measured
-FASTER = 16.0  # squared ratio to the fastest rate so far from which slow noise is unknown anew
-# standard deviations of a wild value; a wild value followed by a normal one is no fault
+# Smallest ratio of a variance to the expected one: noise may return to normal at any
+# time.
+QUIETEST = 0.1
+# The same for blocks. At rest, means of quantised values scatter less.
+QUIETEST_BLOCK = 0.03
+# Largest ratio of a block variance to the expected one: such noise hides any fault.
+LOUDEST = 1e4
+# Assumed ratio of the long-time variance to the block variance before it is measured.
+UNKNOWN = 16.0
+# Slow noise is unknown again from this ratio of the squared rate to the largest so far.
+FASTER = 16.0
+# Standard deviations of a wild value. A wild value before a normal one is no fault.
 WILD = 5.0
-WILD_EVENTS, WILD_SAMPLES = (
-    0.02,
-    4000.0,
-)  # prior: one wild value in 200 000, with the weight of 4000 samples
-# factor on a long-time level, below the scatter of its estimate from at most 80 values
+# Prior: one wild value in 200 000, with the weight of 4000 samples.
+WILD_EVENTS, WILD_SAMPLES = 0.02, 4000.0
+# Factor on a long-time level. It allows for the scatter of an estimate from 80 values.
 SURELY = 0.8
 TRUST = 50.0  # largest degrees of freedom: more counts as normal
 TAIL_MEMORY = 6000.0
 TAIL_FIRST = TAIL_MEMORY / 3.0
 """Samples over which the weight of the tails is averaged (a minute), and the weight of
 the first guess."""
-# standard deviation of products of adjacent squares in white noise, cut at `FAR`
+# standard deviation of products of squares two samples apart in white noise, cut at `FAR`
 TAIL_SCATTER = 2.8
 LEARNED_IN = (
     64.0  # samples per degree of freedom: `TRUST` is reached in half a minute at 100 Hz
@@ -121,14 +123,13 @@ class Noise:
     counted: Channels  # how many
     cross: Channels  # relative correction of the variance by the common motion
     square: Channels  # mean of half squared differences
-    neighbours: Channels  # mean product of adjacent ones
+    neighbours: Channels  # mean product of two that are two samples apart
     squares: Pair  # the last two
     degrees: Channels  # degrees of freedom of the noise, as of a Student's
     share: Channels  # of the variance of a block's statistic that is noise
 
 
-# corrected values before, 20 ms apart, that a fourth difference is of with the present
-# one
+# Earlier corrected values in a fourth difference, 20 ms apart, beside the present one.
 PAST = 4
 
 
@@ -266,10 +267,10 @@ def update_sample_noise(
 
 @compiled
 def count_wild(noise: Noise, scale: int, n: int, mask: int, t: Array) -> None:
-    """Remember statistics (n,), and count wild ones that have come and gone: a lasting error does not.
+    """Store the statistics (n,), and count wild values that a normal one follows.
 
-    The inverse of how often a value is wild without a fault is the largest likelihood
-    ratio of one value.
+    A lasting error is not counted. The share of wild values without a fault limits the
+    likelihood ratio of a single value to its inverse, ``noise.cap``.
     """
     for i in range(n):
         if mask >> i & 1:
@@ -314,10 +315,12 @@ def update_sample_variance(
 
 @compiled
 def update_degrees(noise: Noise, n: int, mask: int) -> None:
-    """Degrees of freedom, as of a Student's: ``3 + 0.5 / x`` with ``x = E[d d'] / E[d]^2 - 1`` of adjacent squares d.
+    """Update the degrees of freedom, as of a Student's: ``3 + 0.5 / x``.
 
-    Gyros of a kind have tails of a kind: x is the mean of all, or of a channel by
-    itself if that is more for certain.
+    ``x = E[d d'] / E[d]^2 - 1``, where d and d' are half squared differences two
+    samples apart, which have no value in common. Gyros of one kind have tails of one
+    kind: x is the mean over all channels, or a channel's own x if that is certainly
+    larger.
     """
     total = 0.0
     count = 0

@@ -173,8 +173,9 @@ def choose(
     """Return the channel, or the channels of the unit, that explains the sample; 0: none does.
 
     A channel is preferred. A unit is chosen where the unit changes the rate far less,
-    because some spikes of a unit look like a spike of one channel of another unit. Where
-    two explanations are equally good, the channels of both are returned.
+    because some spikes of a unit look like a spike of one channel of another unit. If
+    the best explanation is not clearly better than the next one, all candidates are
+    returned, or, where units explain best, all channels of the sample.
     """
     channel = 0
     of_channel = next_channel = math.inf

@@ -58,7 +58,7 @@ def rests(
 
 @compiled
 def update_rest(params: Constants, kf: Estimator) -> None:
-    """Whether the vehicle has rested for the last second: the rate scatters as noise does, about zero."""
+    """Update ``kf.rest``: the last second's rate scatters about zero as noise does."""
     for a in range(3):
         kf.rest_rates[kf.rest_count % REST_BLOCKS, a] = kf.rates[1, a]
     newest = kf.rest_count % REST_BLOCKS

@@ -42,23 +42,23 @@ from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import BURST, FAR, PAST, THREE_SIGMA, SharedNoise
 from fdi_ros.model.samples import Array
 
-MEMORY = 2.0  # half seconds that everything here is a mean of
-LINE = (
-    1.0 / 6.0
-)  # excess of the inverse of the dimensions where all is a line: two dimensions in a parity of three
-INCOHERENT = 0.25  # squared correlation that chance reaches in a second
-COHERENT = 1.0 - INCOHERENT  # from which all is coherent: as far from one
+MEMORY = 2.0  # averaging time of all quantities of this module, in half seconds
+# Excess of the inverse of the dimensions if all noise is one line: 1/2 - 1/3.
+LINE = 1.0 / 6.0
+INCOHERENT = 0.25  # squared correlation that independent noise may have in one second
+COHERENT = 1.0 - INCOHERENT  # squared correlation from which all noise counts as a line
 STEADY = 4.0
-"""Energy of the differences of the rate, over that of noise, up to which the variances
-follow it: motion of which parallel channels see a tenth more or less makes a variance
-wrong by a sixth there."""
+"""Largest energy of the differences of the rate, in units of the noise, at which they
+may shift variance between parallel channels. In stronger motion a channel that sees a
+tenth more of it would look noisier. At this limit its variance is wrong by a sixth."""
 UNEQUAL = 0.15  # relative difference of the units' response to vibration: logs show 0.04 to 0.6
 INDEPENDENT = (
     4.0  # values of a block that are independent of one another: all four at 100 Hz
 )
-MOST_CHECKED = 250.0  # blocks (10 s) that the level while checked is a mean of
-# share added to Q, and of 1e-11 (rad/s)^2: there may be an axis about which nothing is
-# measured
+# Blocks, 10 s, over which the level of checked channels is averaged.
+MOST_CHECKED = 250.0
+# Share of Q, and of 1e-11 (rad/s)^2, added to the diagonal of Q so that Q has an
+# inverse even if nothing measures the rate about an axis.
 NEAR_SINGULAR = 1e-3
 
 

@@ -3,7 +3,8 @@
 
 """Snapshots of the states, and widening after holes in the stream.
 
-After a fault the estimator goes back to a snapshot 0.12 to 490 s old. Each tier keeps eight.
+After a fault the estimator goes back to a snapshot. The tiers keep eight snapshots
+each, 0.12, 1, 8, 61 and 490 s apart, so the oldest is about an hour old.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from fdi_ros.estimator.estimator import (
 )
 
 UNWATCHED, LONG_HOLE = 3e-4, 3600.0
-"""Random walk of a bias over a hole, rad/s/sqrt(s), which has gone its way, of a
-turn-on bias, in an hour."""
+"""Random walk of a bias during a hole, rad/s/sqrt(s), and the longest counted hole, s.
+After an hour the walk has reached the size of a turn-on bias and grows no more."""
 AFTER_HOLE = 5.0 * LONG_TIME
 """s of samples after a hole in which biases are compared with those before: five
 comparisons, and by then the states know what they can learn of the biases."""
@@ -46,7 +47,10 @@ def keep_snapshot(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def pass_hole(params: Constants, kf: Estimator, seconds: float) -> None:
-    """Widen the biases after a hole, in the snapshots too, which the biases after the hole are compared with."""
+    """Widen the biases after a hole, in the present states and in all snapshots.
+
+    Later the biases are compared with those of a snapshot from before the hole.
+    """
     if not is_after_hole(params, kf):
         kf.hole_at = kf.seconds - seconds
         kf.hole_sample = kf.samples

@@ -38,9 +38,9 @@ PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
 #: vibrates with a multiple of 50 Hz seems to have a slow error. 111 Hz show the vibration
 #: up to half of that, and the multiples of 111 Hz hardly pass the autopilot's filter.
 OVERSAMPLING = 20 / 9
-READ_EVERY = 100 * MS  #: The parameters are read so often in flight, ns.
-READ_ON_GROUND = NS // 2  #: And so often on the ground, ns.
-READ_HURRIED = 50 * MS  #: And so often while an order may depend on them, ns.
+READ_EVERY = 100 * MS  #: Time between two readings of the parameters in flight, ns.
+READ_ON_GROUND = NS // 2  #: The same on the ground, ns.
+READ_HURRIED = 50 * MS  #: The same while an order may depend on the parameters, ns.
 FORGOTTEN = 10 * NS  #: An older report of a parameter is not known any more, ns.
 ABSENT = 5 * NS  #: A monitor without diagnostics for this time is in doubt, ns.
 LATE = 1.0  #: Age of the newest judged sample from which the monitor is late, s.

@@ -27,8 +27,10 @@ from fdi_ros.mavlink.protocol import MS, NS, Vector
 
 AVERAGED = 120 * MS  #: Differences are averaged over the samples of this time, ns.
 CURRENT = 500 * MS  #: Oldest pair of samples that still counts, ns.
-DECAY = 0.5  #: Time constant with which the largest size of late decays, s,
-HEALED = NS // 2  #: until the IMU has agreed for this time, ns.
+#: Time constant with which the recent largest size decays, s. Once the IMU has agreed
+#: for `HEALED`, only the present size counts.
+DECAY = 0.5
+HEALED = NS // 2  #: Time of agreement after which an earlier size is forgotten, ns.
 LASTING = 300 * MS  #: A set must stand for this time to name an IMU, ns.
 VOTE = 2.0  #: Least error of the odd one in a set of several IMUs, in ``min_size``.
 LARGE = 0.3  #: Difference from which any doubt of the monitor names the odd IMU, rad/s.
@@ -42,16 +44,18 @@ SCALE = 0.05
 #: 120 ms leaves less of a vibration faster than 11 Hz.
 STEADY = 1 / 3
 SKEW = 20 * MS  #: Two IMUs may measure this far apart in time, ns.
-QUICK = 50 * MS  #: All samples of this time must differ by `LARGE` or `CLEAR`, ns,
-FEWEST = 3  #: and this number of samples.
+#: The last samples must all differ by `LARGE` or `CLEAR`: those of at least this time,
+#: ns, and at least `FEWEST` of them.
+QUICK = 50 * MS
+FEWEST = 3  #: Smallest number of samples in `QUICK`.
 SIZED = 80 * MS  #: The size in a text is averaged over this time, ns.
 WHOLE = 0.5  #: Share of the largest axis from which a second one is off as well.
 ALIKE = 0.05  #: Two IMUs agree within this share of the odd one's difference, too.
-TRUSTED = (
-    2 * NS
-)  #: IMUs are trusted once all have agreed with each other for this time, ns.
-REPEATING = 100 * MS  #: A gyro that repeats one value for this time is stuck, ns,
-MOVED = 0.02  #: if the rate of another one has changed by this meanwhile, rad/s.
+TRUSTED = 2 * NS  #: IMUs are trusted after all have agreed for this time, ns.
+#: A gyro is stuck if it repeats one value for this time, ns, while the rate of another
+#: gyro changes by `MOVED`.
+REPEATING = 100 * MS
+MOVED = 0.02  #: Change of rate that proves a motion, rad/s.
 #: States of channels that are a doubt.
 DOUBTS = {
     ChannelState.SUSPECT,
@@ -236,8 +240,8 @@ class Evidence:
         self._sizes = [UNKNOWN] * count  # largest of late, by axis, rad/s
         # Doubts of the monitor that agreement has refuted. None: the IMU is not trusted.
         self._refuted: list[set[ChannelState] | None] = [None] * count
-        # Axes that are FAULTY or in a set, since when the IMU has agreed despite of that,
-        # ns, and the axes for which that has lasted for `TRUSTED`.
+        # Axes of each IMU that are FAULTY or in a set; since when the IMU agrees
+        # although they are, ns; and the axes for which this has lasted for `TRUSTED`.
         self._named: list[set[int]] = [set()] * count
         self._named_at = [0] * count
         self._outdated: list[set[int]] = [set()] * count
@@ -426,12 +430,15 @@ class Evidence:
     def _odd_one(
         self, units: Sequence[int], apart: Apart, now: int
     ) -> tuple[int, set[int], int]:
-        """Return the IMU that is bad without a name, its axes, and how long that must stand.
+        """Return an IMU that is bad although the monitor does not name it.
 
-        Of three IMUs that is the one that is off while the two others agree: by `CLEAR`,
-        or by less if the monitor has a doubt too. Else the only IMU with a set, unless
-        one of two others is not trusted: two that fail alike put the third into a set.
-        -1: none.
+        Also return its axes, and for how long this must last before it counts, ns.
+        `NOBODY` if there is none.
+
+        Of three IMUs it is the one that is off by `CLEAR` while the two others agree,
+        or by less if the monitor doubts it too. Otherwise it is the only IMU with a
+        set. If one of two others is not trusted, a set proves nothing: two IMUs that
+        fail alike put the healthy third one into a set.
         """
         for k in units:
             if not self._is_odd(k, units, apart):

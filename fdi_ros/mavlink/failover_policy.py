@@ -26,12 +26,12 @@ Definitions
 `failover_evidence.Evidence` finds which IMUs are apart, named and blamed.
 
 Rules, in this order at each tick
-    1. Held IMUs go back in use if the operator asks, if no other IMU is left in use
-       that is not stuck, or if they have not been apart for a pause: `PAUSE`, doubled each time the IMU
-       is taken out in a flight. In flight that needs a live monitor. On the ground an
-       IMU stays out that is still named, or of which the monitor reports nothing. An IMU
-       that was out when the autopilot started has no notch filters: only the operator or
-       rule 4 puts it back.
+    1. A held IMU goes back in use in three cases: the operator asks; every other IMU is
+       stuck or out of use; or the IMU has not been apart for a pause. The pause is
+       `PAUSE`, doubled each time the IMU is taken out in one flight. In flight the
+       third case needs a live monitor. On the ground the IMU stays out while the
+       monitor names it or does not report. An IMU that was out when the autopilot
+       started has no notch filters: only the operator or rule 4 puts it back.
     2. In flight, the worst bad IMU to which `objection` has nothing becomes held. At
        most ``limit`` IMUs are ours, without a limit all but one.
     3. Orders are sent until the autopilot reports the wanted state. An order to take an
@@ -55,7 +55,8 @@ from typing import NamedTuple
 from fdi_ros.mavlink.protocol import MS, NS
 
 FRESH = 200 * MS  #: Largest age of the report on which an IMU counts as a reserve, ns.
-SETTLED = 2 * NS  #: Longest way of a parameter message, ns.
+#: After this time, ns, no report from before an order is still under way.
+SETTLED = 2 * NS
 #: A report against our order is ignored for this time after the order, ns: ArduPilot
 #: answers a read up to 100 ms late, with the value from the time of reading.
 STALE_ANSWER = NS // 2

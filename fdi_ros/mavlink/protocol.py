@@ -277,9 +277,9 @@ GRAIN = MS  #: Largest step of the times in answers, ns.
 LONGEST = NS  #: Longer round trips are ignored, ns.
 SURE = 3  #: Contradicting times or answers in a row that are believed.
 _KEPT = 64  # largest number of round trips, and of requests under way
-FIRST_FOR = 20  #: Number of first requests,
-FIRST_EVERY = NS // 10  #: their interval, ns,
-THEN_EVERY = NS // 2  #: and that later, ns.
+FIRST_FOR = 20  #: Number of requests at the short interval `FIRST_EVERY`.
+FIRST_EVERY = NS // 10  #: Interval of the first requests, ns.
+THEN_EVERY = NS // 2  #: Interval of later requests, ns.
 
 
 class TimeSync:

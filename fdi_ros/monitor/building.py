@@ -29,8 +29,8 @@ from fdi_ros.model.noise import MAX_RUN_LENGTH, FalseAlarmRate, NoiseModel, norm
 from fdi_ros.model.quantity import RATE, Quantity
 
 UNIT_DELAY, CHANNEL_DELAY = 0.015, 0.001
-"""Standard deviation of what is not known of the delay between units, before motion shows it: with stamps of their own,
-and where all channels arrive in one message, s."""
+"""Prior standard deviation of the delay between two units, s: for units with stamps of
+their own, and for channels that arrive in one message."""
 BOUND_IN_NOISE = 4.0  # default guaranteed bound, in noise_std. White noise exceeds the bound in 6e-5 of samples
 REST_NOISE = (
     4.0  # at rest the standard deviation of a channel is at most this many noise_std

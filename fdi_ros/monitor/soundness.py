@@ -93,7 +93,7 @@ class UnitHealth:
     rate_hz: float | None = None
     """Usual messages per second, Hz. None: not measured."""
     slow_from_s: float | None = None
-    """Start of the longest time with fewer than half of its messages, s. None: no such time."""
+    """Start of the longest time with fewer than 60 % of its messages, s. None: none."""
     slow_to_s: float | None = None
     """End of that time, s. None: no such time, or it lasts to the end."""
     slow_rate_hz: float | None = None

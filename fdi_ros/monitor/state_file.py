@@ -36,8 +36,9 @@ BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')  # what a state file begins with
 MAX_BYTES = 1 << 20  # largest state file, bytes. Longer files are damaged
 PLAUSIBLE = 5.0  # expected standard deviations within which a saved error is believed, beside its walk since
 MOVED = 2.0
-"""Errors are saved again when one is off the saved one by so many of its standard deviations, or known so many times
-better. In between, the random walk that the age stands for on restoring covers it."""
+"""Errors are saved again once one of them differs from its saved value by this many
+standard deviations, or is known this many times better. A smaller change is covered by
+the random walk that is added for the age of the file when it is restored."""
 DIGITS = 9  # of the figures saved
 RETRY = 1.0  # time until a failed save is tried again, s
 

@@ -46,7 +46,9 @@ from fdi_ros.system.text import LINE, shown
 
 DEPTH = 256  # messages that a topic keeps, in and out, for a busy node: a quarter of a second at 1 kHz
 REPORT_PERIOD = 1.0  # from one regular report of a node to the next, s
-MOST_LINES = 20  # of one severity in one such period: what anybody may cause with requests hides no declaration
+# Most lines of the log of one severity in a `REPORT_PERIOD`: lines that anybody can
+# cause with requests must not hide a declaration.
+MOST_LINES = 20
 LONGEST = 0.05  # longest turn, s: reports and requests do not wait for a flood
 FLOOD = 5000  # events that may wait in the queue of an executor: some 50 ms of its work, 1 MB
 FLOOD_TIME = (

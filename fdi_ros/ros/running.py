@@ -53,7 +53,7 @@ MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that
 LATE_SAMPLE = 0.5
 """Age from which the newest judged sample is reported, s: several times the time that the slowest link and the
 alignment take. A starved computer, or clocks that differ, look like this."""
-ARRIVES = 0.1  # a topic on which the last check but one found no message is silent, s
+ARRIVES = 0.1  # messages arrive if the last one is younger than this, two checks, s
 NAMED = 4  # publishers of one topic that are named at most
 QUIET = 5.0  # after a line about a channel, time until the next one unless its state gets worse, s
 BY_SEVERITY = (

@@ -42,7 +42,8 @@ from fdi_ros.setup.estimate import (
 from fdi_ros.setup.noise import projector
 from fdi_ros.setup.positions import delays_of, turning_of
 
-#: share of its samples that an accelerometer must give
+#: Smallest share of usable samples of an accelerometer, relative to the median of all
+#: (counted as at least this share, too).
 LEAST_USABLE = 0.3
 #: largest angle between the specific forces of two units, rad: swapped or reversed axes
 #: make more

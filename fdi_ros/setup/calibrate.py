@@ -79,8 +79,8 @@ LEAST_DURATION, LEAST_SAMPLES, LONGEST_STEP = (
 LEAST_USABLE = 0.3
 #: longest fault, as a share of the recording, for which the others decide
 MOST_FAULTY = 0.35
-#: share of the channels of a set that is left out: of a larger one nobody knows which
-#: are right
+#: Largest set, as a share of all channels, whose samples are left out. A larger set
+#: says too little about which channels are right.
 MOST_LEFT_OUT = 1 / 3
 LOUDER = 4.0
 """Largest ratio of the noise in motion to noise_std. The monitor would not accept more

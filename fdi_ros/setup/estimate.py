@@ -59,10 +59,10 @@ from fdi_ros.setup.smoother import (
     smooth,
 )
 
-#: of scale error and misalignment before anything is shown, in each component: 0.5 %
-#: and 0.5 deg
+#: Prior standard deviation of each component of scale error and misalignment: 0.5 % and
+#: 0.5 deg.
 SCALE_STD = 0.008
-#: of channels that are taken as configured
+#: The same for reference channels, whose axes are taken as configured.
 REFERENCE_STD = 1e-6
 PASSES = 12
 TRUSTING = PASSES // 3
@@ -71,10 +71,11 @@ errors look like vibration.
 """
 #: change of delays, s, and relative change of axes, below which a pass has settled
 SETTLED = 2e-5
-#: s, a tenth of a sample at 100 Hz: of a delay, error that is small, and change that
-#: moves no bias
+#: Largest standard error of a delay that counts as known, s, and largest change of a
+#: delay in a pass from which the walk of the biases is found: a tenth of a sample at
+#: 100 Hz.
 SHOWN_DELAY = 0.001
-#: s
+#: Largest delay that can be configured, s.
 LARGEST_DELAY = PARAMETERS["imus.delays"].high
 #: largest change of a delay in one pass, s, as slopes hold for nearby motion only
 STEP_DELAY = 2.0 * UNIT_DELAY
@@ -86,14 +87,15 @@ ABSENT = 1e12
 ALIKE = 5.0
 #: walk of biases that show none, rad/s/sqrt(s)
 USUAL_WALK = 2e-5
-#: axes that are farther off than expected by so much are known less: once in 60 by
-#: chance, of two units
+#: If the axes are off by more than this multiple of their prior, the prior is widened.
+#: With two units chance does that once in 60 recordings.
 WIDER = 1.5
-#: fewest blocks for the noise of a window, and blocks per mean for its colour
+#: Smallest number of blocks for the noise of a window, and of windows for the colour of
+#: the noise; number of blocks in each mean that shows the colour.
 LEAST_BLOCKS = SUBS = 5
-#: one, the rate, the angular acceleration
+#: Number of base signals: one, the rate (3), and the angular acceleration (3).
 BASE = 7
-#: kinds of error states, whose signals are linear in these
+#: Estimated kinds of error states. Their signals are linear in the base signals.
 ESTIMATED = (
     "bias",
     "scale",
@@ -262,7 +264,8 @@ class _Pass:
     """One linearisation: rest, rate and noise of every window, and evidence for the states.
 
     ``delay`` (units,): taken off the blocks, s. ``axes`` (n, 3). ``biases`` (K, n): of
-    joined windows, rad/s. ``known``: whether the biases come from an earlier pass.
+    joined windows, rad/s. ``known``: whether the biases have been refined by two
+    passes.
     ``colour`` (2, n): variance of longer means over that of white noise, at rest and in
     motion.
     """
@@ -430,7 +433,7 @@ class _Pass:
         mean = np.add.reduceat(rate, blocks.start, axis=0) / REST_BLOCKS
         limit = ALIKE * np.sqrt(noise / REST_BLOCKS + REST_STD**2)
         found &= (np.abs(mean - np.median(mean[found], axis=0)) < limit).all(axis=1)
-        # Beside motion its beginning is hidden by the noise.
+        # Noise may hide the beginning of a motion: drop rest windows beside motion.
         found &= np.append(True, found[:-1]) & np.append(found[1:], True)
         return found & (float(found.sum()) * REST_BLOCKS * blocks.length >= LONG_TIME)
 
@@ -512,8 +515,8 @@ class _Pass:
     def _beyond_vibration(self, moments: Array, count: Int) -> Array:
         """Return the part (W, 7, 7) of moments M (W, 7, 7) beyond vibration: M (M + K)^-1.
 
-        K is W count^2 min(U, s^2) in units of e^2 (docs/calibration.md, "What vibration
-        explains").
+        K is W count^2 min(U, s^2), here times the largest share e^2 of vibration in the
+        variance of a channel (docs/calibration.md, "Vibration").
         """
         variance = self.variance
         moving = ~self.rest

@@ -58,7 +58,8 @@ LEAST_BLOCKS = 5
 TURNING = 3.0
 #: fits, each with the noise that the one before left in every window
 ROUNDS = 3
-#: of the walking bias, and of position, scale and mount errors, and delay
+#: Numbers of states: the walking bias; and bias, position (3), scale and mount errors
+#: (9) and delay together.
 BIASES, STATES = 3, 16
 
 
@@ -230,9 +231,9 @@ def _position(
         if residual is difference:
             total = np.add.reduceat(difference, blocks.start)
             square -= (total**2).sum(axis=1) / np.maximum(count, 1)
-        # Smoothing keeps the mean of white noise, not its size.
+        # Smoothing has reduced the variance of white noise by this factor.
         variance = square / np.maximum(3 * count - 3, 1) / (ALIKE**2).sum()
-        # A window is quiet by chance, too.
+        # Some windows are quiet only by chance: bound their variance from below.
         variance = np.maximum(variance, 0.5 * np.median(variance[known]))
         weight = np.where(known, 1.0 / np.maximum(variance, 1e-18), 0.0)
         of = NormalEquations(

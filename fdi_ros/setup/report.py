@@ -85,7 +85,8 @@ FLOOR, LEAST_NAMED = 0.1, 0.9
 LEAST_JUDGED = 0.5
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 NOISE_HINT = (
-    "Standard deviation of one sample, over windows of 10 s, vibration included. noise_std (marked at the left) is the"
+    "Standard deviation of one sample, averaged over 5 s, vibration included."
+    " noise_std (marked at the left) is the"
     " level of the quietest windows; the monitor measures in flight what vibration adds."
 )
 FORCE_HINT = (
