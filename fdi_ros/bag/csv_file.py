@@ -35,6 +35,7 @@ from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.flight_log import FlightLog, ImuSamples, Portion, Source, imu_samples
 from fdi_ros.bag.raw import MOST_SHOWN, Damage
 from fdi_ros.errors import BagError
+from fdi_ros.model.quantity import STANDARD_GRAVITY
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system.files import (
     CSV_COLUMNS,
@@ -61,15 +62,14 @@ _RATE_UNITS = {
     "deg_s": _DEGREES,
     "dps": _DEGREES,
 }
-_GRAVITY = 9.80665
 _FORCE_UNITS = {
     "m/s^2": 1.0,
     "m/s2": 1.0,
     "m/s²": 1.0,
     "m_s2": 1.0,
     "mps2": 1.0,
-    "g": _GRAVITY,
-    "mg": 1e-3 * _GRAVITY,
+    "g": STANDARD_GRAVITY,
+    "mg": 1e-3 * STANDARD_GRAVITY,
 }
 _UNIT = re.compile(
     r"[\[(]([^\d\[(\])][^\[(\])]*)[\])]$|_(rad_s|radps|deg_s|dps|m_s2|mps2|m?g)$|(?<=[a-z])_?(ns|us|ms)$|_(s|sec)$"

@@ -39,7 +39,6 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_log import (
     FLU,
-    LARGEST_DEVICE,
     FlightLog,
     ImuSamples,
     Portion,
@@ -117,7 +116,6 @@ _FLIGHT = {
 }
 _THROTTLE = ("ThO", "ThrOut")
 _TEMPERATURE = ("T", "Temp")
-_DEVICE = re.compile(r"INS_GYR([23]?)_ID")
 _VEHICLE = re.compile(r"(?:Ardu|APM:)(Copter|Plane|Rover|Sub)\b")
 _UNITS = {
     "FMTU": ("FmtType", "UnitIds", "MultIds"),
@@ -403,9 +401,7 @@ class DataflashLog(FlightLog):
             for text, value in zip(
                 rows["Name"].tolist(), rows["Value"].tolist(), strict=True
             ):
-                found = _DEVICE.fullmatch(text.decode("ascii", "replace"))
-                if found and 0 < value < LARGEST_DEVICE:
-                    self.devices[int(found[1] or 1) - 1] = int(value)
+                self.take_parameter(text.decode("ascii", "replace"), value)
         elif not {"TimeUS", "TimeMS"} & columns:
             return
         elif name == "MODE":

@@ -74,6 +74,8 @@ _MOST_COMPARED = 16
 _MOST_NAMES = 6
 #: board and its serial number, as ArduPilot sends both at its start
 _BOARD = re.compile(r"[\w-]+ ([0-9A-F]{8} [0-9A-F]{8} [0-9A-F]{8})")
+#: parameter of ArduPilot with the device of a gyro
+_DEVICE_PARAMETER = re.compile(r"INS_GYR([23]?)_ID")
 #: ids of devices have 32 bits
 LARGEST_DEVICE = 1 << 32
 #: full throttle, by the message: 1, per cent, or thousandths in old logs
@@ -300,6 +302,12 @@ class FlightLog(BagFile):
         changed = not self.modes or self.modes[-1].name != name
         if changed and len(self.modes) < MOST_MODES:
             self.modes.append(Mode(stamp, name))
+
+    def take_parameter(self, name: str, value: float) -> None:
+        """Take a parameter of ArduPilot. Those with the device of a gyro are kept."""
+        found = _DEVICE_PARAMETER.fullmatch(name)
+        if found and 0 < value < LARGEST_DEVICE:
+            self.devices[int(found[1] or 1) - 1] = int(value)
 
     def add_temperature(
         self, instance: int, stamp: NDArray[Any], value: NDArray[Any]

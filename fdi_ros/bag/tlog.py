@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import re
 import struct
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -23,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from fdi_ros.bag.flight_log import (
-    LARGEST_DEVICE,
     ImuSamples,
     Portion,
     Source,
@@ -52,7 +50,6 @@ from fdi_ros.system.files import (
 _IMUS = tuple(message.name for message in MESSAGES.values())
 _BESIDE = ("HEARTBEAT", "PARAM_VALUE", "VFR_HUD", "STATUSTEXT", "AUTOPILOT_VERSION")
 """Messages that are read beside the rates."""
-_DEVICE = re.compile(r"INS_GYR([23]?)_ID")
 #: first bytes of messages of MAVLink 1 and 2
 _MARKS = (0xFE, 0xFD)
 _TIME = 8
@@ -171,9 +168,7 @@ class Tlog(LibraryLog):
         elif name == "VFR_HUD":
             self.throttle.add(np.array([stamp]), np.array([message.throttle]))
         elif name == "PARAM_VALUE":
-            found = _DEVICE.fullmatch(str(message.param_id))
-            if found and 0 < message.param_value < LARGEST_DEVICE:
-                self.devices[int(found[1] or 1) - 1] = int(message.param_value)
+            self.take_parameter(str(message.param_id), message.param_value)
 
     def origin(self, source: Source) -> str:
         """Return the message of a source: SCALED_IMU2."""

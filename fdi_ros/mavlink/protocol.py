@@ -28,11 +28,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from fdi_ros.model.quantity import STANDARD_GRAVITY
+
 NS, MS = 1_000_000_000, 1_000_000  #: A second and a millisecond, ns.
 
 Vector = tuple[float, float, float]
 
-STANDARD_GRAVITY = 9.80665  # m/s^2
 GYRO_UPDATED = 0b111000  #: Bits of ``fields_updated`` of HIGHRES_IMU for a new gyro.
 ARDUPILOT, PX4 = 3, 12  # MAV_AUTOPILOT of a HEARTBEAT
 NO_AUTOPILOT = 8  #: MAV_AUTOPILOT of other components.

@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+STANDARD_GRAVITY = 9.80665  #: m/s^2
+
 
 class Quantity(NamedTuple):
     """What a group of channels measures, and how large it is beside a body rate.

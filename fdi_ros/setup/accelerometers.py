@@ -50,8 +50,6 @@ LEAST_USABLE = 0.3
 LARGEST_TURN = float(np.radians(30.0))
 #: median specific force of accelerometers that measure in g
 IN_G = (0.8, 1.2)
-#: largest ratio of the noise in motion to noise_std, as for gyros
-LOUDER = 4.0
 #: smallest noise_std written, m/s^2: a bench shows less than a flight, and motion of
 #: units that are not sampled at one instant looks like noise
 LEAST_NOISE_STD = float(PARAMETERS["accelerometers.noise_std"].default[0])
@@ -284,16 +282,13 @@ def _settings(config: Config, active: Int, found: StateEstimate) -> dict[str, ob
         values[active] = new
         return [float(f"{value:.4g}") + 0.0 for value in values]
 
-    std = found.floor.std
-    moving = found.moment[~found.rest]
-    if len(moving):
-        std = np.maximum(std, np.median(moving, axis=0) / LOUDER)
     axes = nominal_axes(config)
     axes[active] = found.axes
     scale = max(found.disagreement()[0], LEAST_SCALE_STD)
     settings: dict[str, object] = {
         "accelerometers.noise_std": changed(
-            own.noise_std, np.maximum(std * FORCE.natural, LEAST_NOISE_STD)
+            own.noise_std,
+            np.maximum(found.noise_std * FORCE.natural, LEAST_NOISE_STD),
         ),
         "accelerometers.scale_std": changed(own.scale_std, scale),
         "accelerometers.bias": changed(own.bias or (0.0,), found.bias * FORCE.natural),

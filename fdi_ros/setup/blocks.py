@@ -26,6 +26,10 @@ from fdi_ros.setup.noise import projector
 SPIKE = 25.0
 #: samples looked at at once
 SPIKE_PORTION = 256
+#: largest distance of two blocks for a difference, in usual distances of neighbours
+LONGEST_SPAN = 2.5
+#: windows are joined down to this number of groups
+MOST_STEPS = 400
 #: of normal errors: standard deviation over median absolute deviation
 MEDIAN_TO_RMS = 1.4826
 
@@ -150,18 +154,31 @@ class Blocks:
 
     def __post_init__(self) -> None:
         self.windows = len(self.start)
-        self.size = np.diff(
-            self.start, append=len(self.mean)
-        )  # (W,) blocks of each window
-        self.window = np.repeat(
-            np.arange(self.windows), self.size
-        )  # (B,) that each block is in
-        self.length = float(
-            np.median(np.diff(self.seconds))
-        )  # usual time from block to block, s
-        self.time = (
-            np.add.reduceat(self.seconds, self.start) / self.size
-        )  # (W,) middle of each window, s
+        #: (W,) number of blocks in each window
+        self.size = np.diff(self.start, append=len(self.mean))
+        #: (B,) window of each block
+        self.window = np.repeat(np.arange(self.windows), self.size)
+        #: usual time from block to block, s
+        self.length = float(np.median(np.diff(self.seconds)))
+        #: (W,) middle of each window, s
+        self.time = np.add.reduceat(self.seconds, self.start) / self.size
+
+    def slopes(self, values: Array) -> Array:
+        """Return central differences (B, c) of values (B, c) of blocks, per second.
+
+        NaN at both ends and beside gaps.
+        """
+        found = np.full_like(values, np.nan)
+        span = self.seconds[2:] - self.seconds[:-2]
+        near = span < LONGEST_SPAN * self.length
+        change = (values[2:] - values[:-2]) / span[:, None]
+        found[1:-1] = np.where(near[:, None], change, np.nan)
+        return found
+
+    @property
+    def group_size(self) -> int:
+        """Number of windows that share one bias: at most `MOST_STEPS` groups remain."""
+        return -(-self.windows // MOST_STEPS)
 
 
 def make_blocks(data: Data, delay: Array) -> Blocks:

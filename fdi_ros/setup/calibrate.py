@@ -82,10 +82,6 @@ MOST_FAULTY = 0.35
 #: Largest set, as a share of all channels, whose samples are left out. A larger set
 #: says too little about which channels are right.
 MOST_LEFT_OUT = 1 / 3
-LOUDER = 4.0
-"""Largest ratio of the noise in motion to noise_std. The monitor would not accept more
-as vibration when motion begins.
-"""
 #: s before a declaration that a fault may have begun: most are declared sooner
 LEAD = 1.0
 #: smallest imus.max_skew where smaller delays are taken off, s
@@ -468,16 +464,14 @@ def _settings(
         whole[active] = new
         return whole
 
-    moving = found.moment[~found.rest]
-    std = found.floor.std
-    if len(moving):
-        std = np.maximum(std, np.median(moving, axis=0) / LOUDER)
     settings: dict[str, object] = {
         "geometry.preset": "axes",
         "geometry.axes": _rounded(changed(geometry.axes, found.axes).ravel(), 6),
         "noise.noise_std": [
             float(f"{value:.4g}")
-            for value in changed(before.noise_std, np.maximum(std, LEAST_NOISE))
+            for value in changed(
+                before.noise_std, np.maximum(found.noise_std, LEAST_NOISE)
+            )
         ],
         "noise.scale_std": _short(changed(before.scale_std, found.disagreement()[0])),
         "noise.timing_std": _short(

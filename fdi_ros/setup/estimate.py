@@ -56,6 +56,7 @@ from fdi_ros.setup.smoother import (
     RandomWalk,
     Smoothed,
     find_random_walk,
+    positive_part,
     smooth,
 )
 
@@ -79,12 +80,12 @@ SHOWN_DELAY = 0.001
 LARGEST_DELAY = PARAMETERS["imus.delays"].high
 #: largest change of a delay in one pass, s, as slopes hold for nearby motion only
 STEP_DELAY = 2.0 * UNIT_DELAY
-#: windows are joined down to this number
-MOST_STEPS = 400
 #: variance of a channel that is not there, (rad/s)^2
 ABSENT = 1e12
 #: largest distance between means of windows at rest, in standard deviations
-ALIKE = 5.0
+SAME_REST = 5.0
+#: largest ratio of the noise in motion to the noise that is written
+LOUDER = 4.0
 #: walk of biases that show none, rad/s/sqrt(s)
 USUAL_WALK = 2e-5
 #: If the axes are off by more than this multiple of their prior, the prior is widened.
@@ -92,7 +93,7 @@ USUAL_WALK = 2e-5
 WIDER = 1.5
 #: Smallest number of blocks for the noise of a window, and of windows for the colour of
 #: the noise; number of blocks in each mean that shows the colour.
-LEAST_BLOCKS = SUBS = 5
+LEAST_BLOCKS = LEAST_WINDOWS = SUBS = 5
 #: Number of base signals: one, the rate (3), and the angular acceleration (3).
 BASE = 7
 #: Estimated kinds of error states. Their signals are linear in the base signals.
@@ -171,6 +172,18 @@ class StateEstimate:
     def rest_seconds(self) -> float:
         """Time at rest, s."""
         return float(self.rest.sum()) * REST_BLOCKS * self.blocks.length
+
+    @property
+    def noise_std(self) -> Array:
+        """Noise of a sample of each channel (n,), rad/s: at rest, or more in motion.
+
+        The monitor accepts at most `LOUDER` times this noise as vibration when motion
+        begins, so the noise is at least that part of the median noise in motion.
+        """
+        moving = self.moment[~self.rest]
+        if not len(moving):
+            return self.floor.std
+        return np.maximum(self.floor.std, np.median(moving, axis=0) / LOUDER)
 
     def disagreement(self) -> tuple[float, float]:
         """Remaining scale error between channels, rms of all components, and its uncertainty.
@@ -344,20 +357,17 @@ class _Pass:
         Blocks in motion without one are no longer used.
         """
         blocks = self.blocks
-        rate = self.rate
-        acceleration = np.zeros_like(rate)
-        inside = np.zeros(len(rate), dtype=bool)
-        span = blocks.seconds[2:] - blocks.seconds[:-2]
-        inside[1:-1] = (span < 2.5 * blocks.length) & self.used[2:] & self.used[:-2]
-        acceleration[1:-1] = (rate[2:] - rate[:-2]) / span[:, None]
+        acceleration = blocks.slopes(self.rate)
+        inside: Mask = np.asarray(np.isfinite(acceleration).all(axis=1))
+        inside[1:-1] &= self.used[2:] & self.used[:-2]
         enough = self.count >= LEAST_BLOCKS
         self.used = self.used & (inside | self.rest[self.window]) & enough[self.window]
-        return acceleration * inside[:, None]
+        return np.where(inside[:, None], acceleration, 0.0)
 
     def _join_windows(self) -> None:
         """Join windows to at most `MOST_STEPS` groups of a constant bias."""
         blocks = self.blocks
-        each = -(-blocks.windows // MOST_STEPS)
+        each = blocks.group_size
         self.groups = [
             slice(first, first + each) for first in range(0, blocks.windows, each)
         ]
@@ -431,7 +441,7 @@ class _Pass:
         if not found.any():
             return found
         mean = np.add.reduceat(rate, blocks.start, axis=0) / REST_BLOCKS
-        limit = ALIKE * np.sqrt(noise / REST_BLOCKS + REST_STD**2)
+        limit = SAME_REST * np.sqrt(noise / REST_BLOCKS + REST_STD**2)
         found &= (np.abs(mean - np.median(mean[found], axis=0)) < limit).all(axis=1)
         # Noise may hide the beginning of a motion: drop rest windows beside motion.
         found &= np.append(True, found[:-1]) & np.append(found[1:], True)
@@ -480,9 +490,7 @@ class _Pass:
         noise = count[:, None, None] * np.linalg.inv(of_rate)
         moments[:, 1:4, 1:4] -= noise
         moments[:, 4:7, 4:7] -= noise / (2.0 * self.blocks.length**2)
-        values, vectors = np.linalg.eigh(moments)
-        positive = np.maximum(values, 0.0)
-        return np.asarray(np.einsum("wab,wb,wcb->wac", vectors, positive, vectors))
+        return positive_part(moments)
 
     def _sums(
         self, flat: Array, a: Array, moments: Array, cross: Array
@@ -569,7 +577,7 @@ class _Pass:
         full &= np.logical_and.reduceat(self.used, blocks.start)
         for regime, windows in enumerate((full & self.rest, full & ~self.rest)):
             chosen = np.flatnonzero(windows)
-            if len(chosen) < LEAST_BLOCKS:
+            if len(chosen) < LEAST_WINDOWS:
                 continue
             rows = blocks.start[chosen][:, None] + np.arange(REST_BLOCKS)
             t = np.einsum(

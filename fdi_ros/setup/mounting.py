@@ -48,7 +48,7 @@ WAITS = (0.02, 0.1, 0.5, 2.0)
 #: example
 VIBRATION = 5.0
 #: |rho| above which isolation takes an error twice as large as detection
-ALIKE = 0.9
+HARD_TO_ISOLATE = 0.9
 
 
 def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, Array]:
@@ -141,7 +141,9 @@ class Mounting:
         rho = np.triu(np.abs(self.geometry.rho), 1)
         # Pairs of channels that cannot be isolated, or only with effort.
         self.alike = np.argwhere(rho > SAME_DIRECTION).tolist()
-        self.similar = np.argwhere((rho > ALIKE) & (rho <= SAME_DIRECTION)).tolist()
+        self.similar = np.argwhere(
+            (rho > HARD_TO_ISOLATE) & (rho <= SAME_DIRECTION)
+        ).tolist()
         self.single = [one for one in self.losses if len(one.lost) < 2]
         self.double = [one for one in self.losses if len(one.lost) == 2]
 

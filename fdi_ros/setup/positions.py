@@ -16,6 +16,7 @@ an axis that no turn shows stay at their prior, with its error.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ import numpy as np
 from fdi_ros.config.config import Config
 from fdi_ros.inspection.turns import SQUARE
 from fdi_ros.model.quantity import FORCE
-from fdi_ros.model.samples import Array, Block, Mask
+from fdi_ros.model.samples import Array, Block, Int, Mask
 from fdi_ros.monitor.accelerometers import (
     UNKNOWN_POSITION,
     accelerometer_names,
@@ -32,16 +33,20 @@ from fdi_ros.monitor.accelerometers import (
     position_variance,
 )
 from fdi_ros.monitor.building import UNIT_DELAY, build_geometry
-from fdi_ros.setup.blocks import make_blocks, prepare
+from fdi_ros.setup.blocks import Blocks, make_blocks, prepare
 from fdi_ros.setup.estimate import (
-    MOST_STEPS,
     SCALE_STD,
     USUAL_WALK,
     StateEstimate,
     misfit,
 )
 from fdi_ros.setup.noise import projector
-from fdi_ros.setup.smoother import NormalEquations, find_random_walk, smooth
+from fdi_ros.setup.smoother import (
+    NormalEquations,
+    find_random_walk,
+    positive_part,
+    smooth,
+)
 
 #: of a position before anything is shown, m
 POSITION_STD = 0.5
@@ -51,9 +56,9 @@ BIAS_STD = 1.5
 SHOWN_POSITION = 0.01
 #: weights of a block and its neighbours: the mean force then lasts as long as the
 #: difference of two rates, to second order
-ALIKE = np.array([1.0, 4.0, 1.0]) / 6.0
-#: fewest blocks of a window in use
-LEAST_BLOCKS = 5
+SMOOTHING = np.array([1.0, 4.0, 1.0]) / 6.0
+#: fewest blocks of a window in use, and fewest such windows
+LEAST_BLOCKS = LEAST_WINDOWS = 5
 #: angular acceleration over its noise, in power, from which a window turns
 TURNING = 3.0
 #: fits, each with the noise that the one before left in every window
@@ -142,11 +147,7 @@ def turning_of(found: StateEstimate) -> tuple[Array, Array]:
     """
     blocks = found.blocks
     rate = found.rate
-    span = blocks.seconds[2:] - blocks.seconds[:-2]
-    acceleration = np.full_like(rate, np.nan)
-    near = (span < 2.5 * blocks.length)[:, None]
-    change = (rate[2:] - rate[:-2]) / span[:, None]
-    acceleration[1:-1] = np.where(near, change, np.nan)
+    acceleration = blocks.slopes(rate)
     # What no rate explains is noise, about alike in all channels.
     apart = projector(found.axes)
     size = np.nan_to_num((np.diff(blocks.mean, axis=0) @ apart) ** 2).sum(axis=1) / 2
@@ -162,13 +163,93 @@ def turning_of(found: StateEstimate) -> tuple[Array, Array]:
 def _smooth(values: Array) -> Array:
     """Average blocks (B, c) with their neighbours; NaN at both ends."""
     found = np.full_like(values, np.nan)
-    found[1:-1] = ALIKE[0] * (values[2:] + values[:-2]) + ALIKE[1] * values[1:-1]
+    found[1:-1] = (
+        SMOOTHING[0] * (values[2:] + values[:-2]) + SMOOTHING[1] * values[1:-1]
+    )
     return found
 
 
 def _cross(vectors: Array) -> Array:
     """Matrices (B, 3, 3) of the vector product with vectors (B, 3)."""
     return np.asarray(np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2))
+
+
+@dataclass(frozen=True)
+class _ForceEvidence:
+    """Evidence of windows (W,) about the difference of the forces of two units.
+
+    States: bias (3), position (3), scale and mount errors (9), delay. Forces are over
+    `FORCE.natural`.
+    """
+
+    #: (B, 3, STATES) change of each force with the bias and with the states
+    signals: Array
+    #: (B, 3) difference of the forces, 0 where unknown
+    difference: Array
+    #: (B,) blocks in use
+    good: Mask
+    #: (W,) blocks in use
+    count: Int
+    #: (W, STATES, STATES) sums of products of signals, without those of noise
+    moments: Array
+    #: (W, STATES) sums of products of signals and difference
+    cross: Array
+
+    @property
+    def known(self) -> Mask:
+        """Windows (W,) with enough blocks."""
+        return np.asarray(self.count >= LEAST_BLOCKS)
+
+
+def _windows_of(
+    first: Array, other: Array, turning: Array, noise: Array, blocks: Blocks
+) -> _ForceEvidence:
+    """Return the evidence in forces (B, 3) of the first unit and of another one."""
+    # The noise of the difference is not that of the mean.
+    difference = _smooth(other - first)
+    mean = _smooth(0.5 * (first + other))
+    signals = np.zeros((len(mean), 3, STATES))
+    signals[:, :, :3] = np.eye(3)
+    signals[:, :, 3:6] = turning / FORCE.natural
+    signals[:, :, 6:15] = np.kron(np.eye(3), mean[:, None, :]).reshape(-1, 3, 9)
+    signals[:, :, 15] = np.gradient(mean, blocks.seconds, axis=0)
+    usable = np.isfinite(signals).all(axis=2) & np.isfinite(difference)
+    good: Mask = np.asarray(usable.all(axis=1))
+    count = np.add.reduceat(good, blocks.start)
+    signals[~good] = 0.0
+    difference = np.where(good[:, None], difference, 0.0)
+    # Of noise alone no position is learned.
+    of_noise = np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(3) - noise
+    of_noise /= FORCE.natural**2
+    power = (signals[:, :, 3:6] ** 2).sum(axis=(1, 2))
+    power = np.add.reduceat(power, blocks.start) / np.maximum(count, 1)
+    turns = power > TURNING * np.trace(of_noise, axis1=1, axis2=2)
+    signals[:, :, 3:6] *= turns[blocks.window][:, None, None]
+    moments = np.add.reduceat(np.einsum("bas,bat->bst", signals, signals), blocks.start)
+    moments[:, 3:6, 3:6] -= (count * turns)[:, None, None] * of_noise
+    cross = np.add.reduceat(np.einsum("bas,ba->bs", signals, difference), blocks.start)
+    return _ForceEvidence(
+        signals, difference, good, count, positive_part(moments), cross
+    )
+
+
+def _weights(
+    evidence: _ForceEvidence, residual: Array, removed: bool, start: Int
+) -> Array:
+    """Return the inverse variance (W,) of residuals (B, 3), 0 without enough blocks.
+
+    ``removed``: whether the residuals are free of the mean bias of their window.
+    """
+    count = evidence.count
+    square = np.add.reduceat((residual**2).sum(axis=1), start)
+    if not removed:
+        total = np.add.reduceat(residual, start)
+        square -= (total**2).sum(axis=1) / np.maximum(count, 1)
+    # Smoothing has reduced the variance of white noise by this factor.
+    variance = square / np.maximum(3 * count - 3, 1) / (SMOOTHING**2).sum()
+    # Some windows are quiet only by chance: bound their variance from below.
+    variance = np.maximum(variance, 0.5 * np.median(variance[evidence.known]))
+    return np.where(evidence.known, 1.0 / np.maximum(variance, 1e-18), 0.0)
 
 
 def _position(
@@ -183,34 +264,9 @@ def _position(
     Returns it with its standard errors, (3,) m.
     """
     blocks = found.blocks
-    # The noise of the difference is not that of the mean.
-    difference = _smooth(other - first)
-    mean = _smooth(0.5 * (first + other))
-    signals = np.zeros((len(mean), 3, BIASES + STATES - 3))
-    signals[:, :, :3] = np.eye(3)
-    signals[:, :, 3:6] = turning / FORCE.natural
-    signals[:, :, 6:15] = np.kron(np.eye(3), mean[:, None, :]).reshape(-1, 3, 9)
-    signals[:, :, 15] = np.gradient(mean, blocks.seconds, axis=0)
-    usable = np.isfinite(signals).all(axis=2) & np.isfinite(difference)
-    good: Mask = np.asarray(usable.all(axis=1))
-    count = np.add.reduceat(good, blocks.start)
-    known = count >= LEAST_BLOCKS
-    if known.sum() < LEAST_BLOCKS:
+    evidence = _windows_of(first, other, turning, noise, blocks)
+    if evidence.known.sum() < LEAST_WINDOWS:
         return np.zeros(3), np.full(3, POSITION_STD)
-    signals[~good] = 0.0
-    difference = np.where(good[:, None], difference, 0.0)
-    # Of noise alone no position is learned.
-    subtracted = np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(3) - noise
-    subtracted /= FORCE.natural**2
-    power = (signals[:, :, 3:6] ** 2).sum(axis=(1, 2))
-    power = np.add.reduceat(power, blocks.start) / np.maximum(count, 1)
-    turns = power > TURNING * np.trace(subtracted, axis1=1, axis2=2)
-    signals[:, :, 3:6] *= turns[blocks.window][:, None, None]
-    moments = np.add.reduceat(np.einsum("bas,bat->bst", signals, signals), blocks.start)
-    moments[:, 3:6, 3:6] -= (count * turns)[:, None, None] * subtracted
-    values, vectors = np.linalg.eigh(moments)
-    moments = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.swapaxes(1, 2)
-    cross = np.add.reduceat(np.einsum("bas,ba->bs", signals, difference), blocks.start)
     prior = np.concatenate(
         [
             np.full(3, BIAS_STD / FORCE.natural),
@@ -219,36 +275,27 @@ def _position(
             [UNIT_DELAY],
         ]
     )
-    each = -(-blocks.windows // MOST_STEPS)
-    groups = np.arange(0, blocks.windows, each)
-    middle = np.add.reduceat(blocks.time, groups) / np.diff(
-        groups, append=blocks.windows
-    )
+    groups = np.arange(0, blocks.windows, blocks.group_size)
+    in_group = np.diff(groups, append=blocks.windows)
+    middle = np.add.reduceat(blocks.time, groups) / in_group
     apart = np.diff(middle, append=middle[-1])
-    residual = difference
-    for _ in range(ROUNDS):
-        square = np.add.reduceat((residual**2).sum(axis=1), blocks.start)
-        if residual is difference:
-            total = np.add.reduceat(difference, blocks.start)
-            square -= (total**2).sum(axis=1) / np.maximum(count, 1)
-        # Smoothing has reduced the variance of white noise by this factor.
-        variance = square / np.maximum(3 * count - 3, 1) / (ALIKE**2).sum()
-        # Some windows are quiet only by chance: bound their variance from below.
-        variance = np.maximum(variance, 0.5 * np.median(variance[known]))
-        weight = np.where(known, 1.0 / np.maximum(variance, 1e-18), 0.0)
+    residual = evidence.difference
+    for number in range(ROUNDS):
+        weight = _weights(evidence, residual, number > 0, blocks.start)
         of = NormalEquations(
             BIASES,
-            np.add.reduceat(weight[:, None, None] * moments, groups),
-            np.add.reduceat(weight[:, None] * cross, groups),
+            np.add.reduceat(weight[:, None, None] * evidence.moments, groups),
+            np.add.reduceat(weight[:, None] * evidence.cross, groups),
             apart,
             prior,
-            np.zeros(len(prior)),
+            np.zeros(STATES),
         )
         walk = find_random_walk(of)
         fitted = smooth(of, walk.value or min(walk.possible, USUAL_WALK))
-        bias = np.repeat(fitted.curve, each, axis=0)[blocks.window]
-        explained = signals[:, :, 3:] @ fitted.constant + bias * good[:, None]
-        residual = difference - explained
+        curve = np.repeat(fitted.curve, blocks.group_size, axis=0)
+        bias = curve[blocks.window] * evidence.good[:, None]
+        explained = evidence.signals[:, :, 3:] @ fitted.constant + bias
+        residual = evidence.difference - explained
     covariance = fitted.constant_covariance[:3, :3] * misfit(of, fitted)
     value = fitted.constant[:3]
     # No recording shows the scale that all gyros have in common.

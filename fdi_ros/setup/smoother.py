@@ -56,6 +56,16 @@ class NormalEquations:
         self.start = start / prior
 
 
+def positive_part(matrices: Array) -> Array:
+    """Return symmetric matrices (W, s, s) with their negative eigenvalues set to 0.
+
+    Moments less the moments of noise have some by chance.
+    """
+    values, vectors = np.linalg.eigh(matrices)
+    positive = np.maximum(values, 0.0)
+    return np.asarray(np.einsum("wab,wb,wcb->wac", vectors, positive, vectors))
+
+
 @dataclass(frozen=True)
 class Smoothed:
     """Estimate of all states."""
