@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bag.recordings import START, imu, write_mcap
 from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
@@ -60,6 +61,12 @@ needs_cases = pytest.mark.skipif(
             4,
             r"LOOK: .*imu_0\.z, imu_1\.z and imu_2\.z measured the end of the range for 1\.8 s",
         ),
+        (
+            CASES / "stamps_in_bursts.csv",
+            4,
+            r"LOOK: no fault .*/imu_1 is left out: stamps come in bursts of about 5",
+        ),
+        (CASES / "mcap_message_zstd", 0, r"HEALTHY: .*9 channels"),
         (CASES / "clean.csv", 0, r"HEALTHY: "),
         (
             LOGS / "quad_25mm_cut_hover.bin",
@@ -89,6 +96,45 @@ def test_spikes_are_counted_on_their_channel_alone(fdi, tmp_path):
     assert summary["verdict"]["channels"] == ["imu_1.y"]
     assert 24 <= spikes.pop("imu_1.y") <= 25
     assert set(spikes.values()) == {0}
+
+
+@needs_cases
+def test_injected_spikes_are_said_of_their_channel_alone(fdi):
+    settings = CASES / "clean_settings.yaml"
+    fault = "channel=imu_1.y kind=spike size=5 rate=1 start=12"
+    words = ("--config", settings, "--fault", fault)
+    said = fdi("replay", CASES / "clean.csv", *words).out
+    lines = said.splitlines()
+    assert "No other channel was declared faulty." in lines
+    assert re.fullmatch(r"imu_1\.y has \d\d spikes of one sample\.", lines[3])
+    assert "noisier" not in said
+
+
+@pytest.mark.parametrize(
+    ("topics", "faulty"),
+    [
+        (["/robot2/imu3/data", "/robot2/imu5/data", "/robot2/imu7/data"], "imu_5"),
+        (["/arm/bno055", "/arm/icm42688", "/arm/mpu6050"], "icm42688"),
+    ],
+)
+def test_the_faulty_unit_is_named_after_its_topic(topics, faulty, fdi, tmp_path):
+    """The second topic is off by 0.3 rad/s from 12 s on, about y."""
+    time = np.arange(0, 20, 0.02)
+    random = np.random.default_rng(8)
+    turn = 0.4 * np.clip(time - 6, 0, 1)[:, None] * np.sin(np.outer(time, (0.7, 1, 2)))
+    messages = []
+    for k, topic in enumerate(topics):
+        rates = turn + random.normal(0, 0.003, turn.shape)
+        rates[(time >= 12) & (k == 1), 1] += 0.3
+        for at, rate in zip((time * 1e9).astype(int).tolist(), rates, strict=True):
+            messages.append((topic, START + at, imu(START + at, rate)))
+    messages.sort(key=lambda one: one[1])
+    write_mcap(tmp_path / "bag.mcap", messages)
+    said = fdi("replay", tmp_path / "bag.mcap")
+    first, second, *_ = said.out.splitlines()
+    assert first.startswith(f"FAULTY: {faulty}.y from 12.")
+    assert f"{faulty} is {topics[1]}" in second
+    assert said.code == 3
 
 
 # Deliveries and values
