@@ -26,10 +26,13 @@ fuzz: venv ## N hostile files, recordings and command lines: make fuzz N=20000
 	@$(RUN) python -m fdi_ros.cli compile
 	@FUZZ_CASES=$(N) $(RUN) python -m pytest -n $(WORKERS) -o faulthandler_timeout=60 test/bag/test_limits.py -k hostile_file $(ARGS)
 
-coverage: venv ## share of the lines of Python that the tests run; compiled code is not seen
+# Tests that only start processes, whose lines are not seen.
+UNSEEN = test/ros test/test_package.py test/test_readme.py test/test_libraries.py
+
+coverage: venv ## share of the lines of Python that the tests run, without nodes and compiled code
 	@$(RUN) python -m fdi_ros.cli compile
 	@$(RUN) python -m pip install --quiet pytest-cov
-	@$(RUN) python -m pytest -n $(WORKERS) --dist worksteal --cov=fdi_ros --cov-report=term:skip-covered $(ARGS)
+	@$(RUN) python -m pytest -n $(WORKERS) --dist worksteal --cov $(UNSEEN:%=--ignore=%) $(ARGS)
 
 check: venv ## style and types
 	@$(RUN) python -m ruff check .

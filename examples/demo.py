@@ -144,7 +144,9 @@ def _introduction(
         f"monitor (fdi_node, ROS_DOMAIN_ID {os.environ['ROS_DOMAIN_ID']}). It measures with {len(names)} gyros:"
         f" {', '.join(units)}, three\naxes each. {fault.start:g} s after the start"
         f" {', '.join(sorted(struck))} goes wrong: the demo adds\n    {fault}\n"
-        "The monitor should name that gyro, and no other. Below: its residual (how far each gyro\n"
+        "The monitor should name that gyro, and no other. In the first turn, at 8 s, all gyros are\n"
+        "UNCHECKED for 0.3 s, but stay in use: only a turn shows whether one IMU measures later\n"
+        "than the other. Below: its residual (how far each gyro\n"
         "is from what the others measure), its state, and the evidence for a fault, which\n"
         "names a gyro when it reaches the threshold.\n"
     )
