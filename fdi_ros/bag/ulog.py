@@ -3,7 +3,7 @@
 
 """PX4's ULog files (.ulg, .ulog), read whole by pyulog.
 
-Rates are in sensor_gyro (board frame), vehicle_imu (body frame, calibrated: angles and
+Rates are in sensor_gyro (board frame; specific forces in sensor_accel), vehicle_imu (body frame, calibrated: angles and
 the time that each took) and sensor_gyro_fifo (board frame, all samples of the sensor,
 stamped with the last). By default these are logged at 1 to 2 Hz, as is
 vehicle_imu_status (body frame, calibrated: the mean of the last 0.1 s). The means of a
@@ -57,6 +57,10 @@ _SUBSCRIPTION, _DATA = b"AD"
 _DEEPEST = 16
 _SELECTED, _STATUS = "sensor_combined", "vehicle_imu_status"
 _KINDS = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo", _SELECTED, _STATUS)
+_RAW_GYRO, _RAW_FORCE = "sensor_gyro", "sensor_accel"
+"""Messages of a gyro, and of an accelerometer, which may be samples of other times."""
+_LONGEST_STEP = 3.0
+"""Longest interval between two samples of an accelerometer that is bridged, in usual ones."""
 _GPS = ("sensor_gps", "vehicle_gps_position")
 _LACKS = "its format lacks a field, or is not that of its samples"
 _WRONG = (
@@ -180,7 +184,7 @@ class Ulog(LibraryLog):
         together = _simultaneous(status)
         self.status = _status_words(status, together)
         self._take_temperatures(found)
-        return found | together
+        return _with_forces(found, _accelerometers(log)) | together
 
     def _take_flight(self, name: str, columns: Columns) -> None:
         """Take modes and throttle."""
@@ -232,9 +236,9 @@ class Ulog(LibraryLog):
                 elif kind == _SELECTED:
                     rate = _array(columns, "gyro_rad")
                 else:
-                    rate = np.stack(
-                        [columns[axis].astype(np.float64) for axis in "xyz"], axis=1
-                    )
+                    rate = _vectors(columns)
+                    if "force[0]" in columns:
+                        acceleration = _array(columns, "force")
         except (KeyError, ValueError):
             return None
         acceleration = (
@@ -243,6 +247,61 @@ class Ulog(LibraryLog):
         if not rate.shape == acceleration.shape == (len(stamp), 3):
             return None
         return imu_samples(stamp, rate * FLU, acceleration * FLU)
+
+
+def _vectors(columns: Columns) -> Array:
+    """Return the values along x, y and z, (k, 3)."""
+    return np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+
+
+def _accelerometers(log: Any) -> dict[int, Columns]:
+    """Return the messages of each accelerometer by its instance."""
+    parts: defaultdict[int, list[Columns]] = defaultdict(list)
+    for one in log.data_list:
+        if one.name == _RAW_FORCE:
+            parts[one.multi_id].append(one.data)
+    return {instance: _joined(columns) for instance, columns in parts.items()}
+
+
+def _with_forces(
+    topics: Mapping[Source, Columns], felt: Mapping[int, Columns]
+) -> dict[Source, Columns]:
+    """Add the specific force to the messages of raw gyros, (k,) ``force[0]`` to ``[2]``.
+
+    It is that of the accelerometer of the same device, or else of the same instance.
+    """
+    by_device = {_device(columns): columns for columns in felt.values()}
+    by_device.pop(0, None)
+    found = dict(topics)
+    for source, columns in topics.items():
+        own = by_device.get(_device(columns)) or felt.get(source.instance)
+        if source.kind == _RAW_GYRO and own is not None:
+            found[source] = {**columns, **_forces_at(_stamp(columns), own)}
+    return found
+
+
+def _device(columns: Columns) -> int:
+    """Return the id of the device of messages. 0: not known."""
+    return int(max(columns.get("device_id", np.zeros(1))[:1], default=0))
+
+
+def _forces_at(times: Int, columns: Columns) -> Columns:
+    """Interpolate the samples of an accelerometer at times (k,), us. NaN outside of them."""
+    try:
+        stamp, first = np.unique(_stamp(columns), return_index=True)
+        force = _vectors(columns)[first]
+    except (KeyError, ValueError):
+        return {}
+    if len(stamp) < 2:
+        return {}
+    step = np.diff(stamp)
+    after = np.searchsorted(stamp, times).clip(1, len(step))
+    bridged = step[after - 1] <= _LONGEST_STEP * np.median(step)
+    inside = bridged & (times >= stamp[0]) & (times <= stamp[-1])
+    return {
+        f"force[{k}]": np.where(inside, np.interp(times, stamp, force[:, k]), np.nan)
+        for k in range(3)
+    }
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:

@@ -223,6 +223,8 @@ def _samples(unit, k, messages):
 ULOG_FORMATS = {
     "sensor_gyro": "uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;float x;float y;float z;"
     "float temperature;uint32_t error_count;uint8_t[3] clip_counter;uint8_t samples;uint8_t[4] _padding0;",
+    "sensor_accel": "uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;float x;float y;float z;"
+    "float temperature;uint32_t error_count;uint8_t[3] clip_counter;uint8_t samples;uint8_t[4] _padding0;",
     "vehicle_imu": "uint64_t timestamp;uint64_t timestamp_sample;uint32_t accel_device_id;uint32_t gyro_device_id;"
     "float[3] delta_angle;float[3] delta_velocity;uint32_t delta_angle_dt;uint32_t delta_velocity_dt;"
     "uint8_t delta_angle_clipping;uint8_t delta_velocity_clipping;uint8_t accel_calibration_count;"
@@ -264,8 +266,8 @@ def ulog_type(name):
     return np.dtype(fields)
 
 
-def write_ulog(path, units, kind="sensor_gyro", gps=True):
-    """A log as PX4 writes it."""
+def write_ulog(path, units, kind="sensor_gyro", gps=True, accel=False):
+    """A log as PX4 writes it. ``accel``: with accelerometers, 300 us before the gyros."""
     out = [
         ULOG_HEAD,
         struct.pack("<Q", max(0, int(units[0].stamp[0]) - 1000)),
@@ -276,11 +278,13 @@ def write_ulog(path, units, kind="sensor_gyro", gps=True):
     out += [
         ulog_message(b"F", f"{name}:{form}".encode())
         for name, form in ULOG_FORMATS.items()
+        if accel or name != "sensor_accel"
     ]
     out.append(
         ulog_message(b"P", b"\x15" + b"int32_t SDLOG_PROFILE" + struct.pack("<i", 1))
     )
     topics = [*((kind, k) for k in range(len(units))), ("sensor_gps", 0)]
+    topics += [("sensor_accel", k) for k in range(len(units)) if accel]
     out += [
         ulog_message(b"A", struct.pack("<BH", k, n) + name.encode())
         for n, (name, k) in enumerate(topics)
@@ -295,6 +299,11 @@ def write_ulog(path, units, kind="sensor_gyro", gps=True):
     )
     out += [
         fixes.tobytes() if gps else b"",
+        *(
+            _raw(unit.acceleration, len(units) + 1 + n, unit.stamp - 300).tobytes()
+            for n, unit in enumerate(units)
+            if accel
+        ),
         samples[np.argsort(samples["timestamp"], kind="stable")].tobytes(),
     ]
     path.write_bytes(b"".join(out))
@@ -335,8 +344,14 @@ def _ulog_samples(unit, number, kind):
             step,
         )
         return out
+    return _raw(unit.rate, number, unit.stamp)
+
+
+def _raw(values, number, stamp):
+    """Messages of a gyro or an accelerometer."""
+    out = _data("sensor_gyro", number, stamp, late=300)
     for a, axis in enumerate("xyz"):
-        out[axis] = unit.rate[:, a]
+        out[axis] = values[:, a]
     return out
 
 

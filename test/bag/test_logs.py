@@ -150,6 +150,23 @@ def test_rates_and_times_are_those_of_the_samples_in_front_left_up(
     )
 
 
+def test_raw_accelerometers_of_px4_are_read_at_the_times_of_the_gyros(tmp_path):
+    """Those of sensor_accel; their own times are others, and the first one begins later."""
+    made = units(seconds=8.0)
+    for unit in made:
+        unit.acceleration[:, 0] = 1e-6 * (unit.stamp - unit.stamp[0])
+    found, _ = messages(log(tmp_path, "sensor_gyro", made, accel=True))
+    for unit, (stamp, rate, raw) in zip(made, found.values(), strict=True):
+        assert len(stamp) == len(unit.stamp)
+        np.testing.assert_array_equal(rate, unit.rate * FLU)
+        felt = [STORE.deserialize_cdr(one, IMU) for one in raw]
+        force = [one.linear_acceleration.x for one in felt]
+        expected = unit.acceleration[:, 0] + 3e-4
+        np.testing.assert_allclose(force[:-1], expected[:-1], atol=1e-6)
+        covariances = [one.linear_acceleration_covariance[0] for one in felt]
+        assert covariances == [0.0] * (len(felt) - 1) + [-1.0]
+
+
 @pytest.mark.parametrize(
     "hole", [bytes(30 << 20), b"\xa3" * 1_000_001, b"\x95\xa3\x00" * 99_999]
 )
