@@ -49,8 +49,7 @@ def give_sample(core: Core, gyros: Core, sample: Sample, half: int) -> None:
             core.sample.spin[a] = core.turning.newest[a]
         for i in range(settings.n):
             given.z[i] /= settings.natural
-            std = math.sqrt(settings.position_variance[i])
-            core.sample.position_std[i] = std / settings.natural
+            core.sample.position_std[i] = settings.position_std[i]
             core.sample.displaced[i] = displaced_variance(core, i)
 
 
@@ -77,8 +76,8 @@ def displaced_variance(core: Core, i: int) -> float:
     """
     settings = core.settings
     turning = core.turning
-    variance = settings.position_variance[i]
-    if variance == 0.0:
+    std = settings.position_std[i]
+    if std == 0.0:
         return 0.0
     omega = turning.rate
     alpha = turning.acceleration
@@ -91,7 +90,7 @@ def displaced_variance(core: Core, i: int) -> float:
         c = (a + 2) % 3
         by = h[b] * alpha[c] - h[c] * alpha[b] + omega[a] * along - speed * h[a]
         square += by * by
-    return float(variance * square / settings.natural**2)
+    return float(std * std * square)
 
 
 @compiled

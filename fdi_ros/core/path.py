@@ -372,12 +372,15 @@ def extend_spell(core: Core, i: int, times: float) -> None:
     longest = core.health.longest_noisy
     if stamp - last.until[i] > NOISY_BREAK:
         last.since[i] = stamp
+        last.samples[i] = 0
         last.times[i] = 0.0
     last.until[i] = stamp
-    last.times[i] = max(last.times[i], times)
+    last.samples[i] += 1
+    last.times[i] += (times - last.times[i]) / last.samples[i]
     if stamp - last.since[i] >= longest.until[i] - longest.since[i]:
         longest.since[i] = last.since[i]
         longest.until[i] = stamp
+        longest.samples[i] = last.samples[i]
         longest.times[i] = last.times[i]
 
 

@@ -272,7 +272,8 @@ class NoisySpell:
 
     since: Stamps  # first noisy sample, ns; 0: there was none
     until: Stamps  # last noisy sample so far, ns
-    times: Channels  # largest noise, over the noise expected
+    samples: Counts  # noisy samples
+    times: Channels  # their mean noise, over the noise expected
 
 
 @record
@@ -572,7 +573,8 @@ class PathSettings:
     places: Counts  # index of each accelerometer in a sample
     arms: Axes  # position of each accelerometer from the first unit, m
     lever: Flag  # a position is not zero
-    position_variance: Channels  # of each accelerometer's position, along one axis, m^2
+    # of each accelerometer's position along one axis, m over the natural size
+    position_std: Channels
     sensors: Sensors
     largest_noise: Real  # noise_std of the noisiest channel, rad/s
     units: Whole

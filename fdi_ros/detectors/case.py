@@ -86,9 +86,9 @@ OTHERS, TURNED = 6.0, 0.3
 many standard deviations, which noise does not reach in a flight, plus this share of the
 named error, because the axes are not exactly known."""
 ALIKE = 1e-3  # least share of the variance of a channel that others do not explain
-LARGEST_MOVE, WARMS = 0.04, 30.0
-"""All biases may move by this many rad/s within this many seconds without a fault: the
-sensors warm, or rectify vibration."""
+WARMS = 30.0
+"""Time within which all biases may move by `Constants.largest_move` without a fault, s: the sensors
+warm, or rectify vibration."""
 UNSOLVED = 10.0
 """Time after which a case that no hypothesis explains ends, s. The error model is wrong there,
 and while all channels are suspects, the estimator learns nothing better."""
@@ -111,8 +111,9 @@ LONGEST_DRIFT = WARMS * (1 << DRIFT_TIMES)
 `DRIFT_TIMES` times, each half as long as the one before: 480, 240, 120 and 60."""
 # time after a gap before the mean starts anew, s: equal to the time that a name must stand
 LEAST_RETURN = 0.2
-# largest move of all biases at once, rad/s: motors that start move them by some 0.005
-LARGEST_STEP = 0.015
+# largest move of all biases at once, over the largest within `WARMS`: motors that start move
+# gyros by some 0.005 rad/s of 0.04
+LARGEST_STEP = 0.375
 FASTEST = (
     2.5  # peak rate of a move over the mean rate: warming is fastest at the beginning
 )
@@ -600,14 +601,14 @@ def let_biases_move(params: Constants, state: State, std: float) -> bool:
     case = state.case
     n = params.sensors.n
     lately = case.moved * math.exp(-(kf.seconds - case.moved_at) / WARMS) + std
-    if lately > LARGEST_MOVE or std > LARGEST_STEP:
+    if lately > params.largest_move or std > LARGEST_STEP * params.largest_move:
         return False
     case.moved = lately
     case.moved_at = kf.seconds
     case.moved_since = case.onset
     for i in range(n):
         case.reference[i] = kf.states.x[i]
-    move_biases(params, kf, std, 0.5 * LARGEST_MOVE / WARMS)
+    move_biases(params, kf, std, 0.5 * params.largest_move / WARMS)
     kf.noise.lived[kf.noise.regime] = 0.0
     update_unknown(kf.noise, n, 0.0)
     forget_evidence(params, state)
@@ -626,11 +627,11 @@ def goes_too_far(params: Constants, state: State) -> bool:
     for r in range(params.layout.count):
         far = (
             r < params.sensors.n
-            and abs(kf.states.x[r] - case.reference[r]) > LARGEST_MOVE
+            and abs(kf.states.x[r] - case.reference[r]) > params.largest_move
         )
         if far or (
             0 <= feeds[r] < params.sensors.n
-            and abs(kf.states.x[r]) * WARMS > FASTEST * LARGEST_MOVE
+            and abs(kf.states.x[r]) * WARMS > FASTEST * params.largest_move
         ):
             return True
     return False
@@ -641,7 +642,7 @@ def undo_move(params: Constants, state: State) -> None:
     """Open a case at the onset of a supposed move of all biases, and accept no move for `WARMS`."""
     case = state.case
     case.onset = case.moved_since
-    case.moved = math.e * LARGEST_MOVE
+    case.moved = math.e * params.largest_move
     case.moved_at = state.estimator.seconds
     open_case(params, state)
 

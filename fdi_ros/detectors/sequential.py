@@ -451,6 +451,8 @@ class Sequential(Detector):
     bias_move
         By which a healthy bias may move within seconds, standard deviation, rad/s: a
         fault has to be beyond that, unless it is sudden.
+    largest_move
+        By which all healthy biases may move together within half a minute, rad/s.
     delay_std
         Standard deviation of the delay of one unit against another, s.
     gain_is_fault
@@ -478,6 +480,7 @@ class Sequential(Detector):
         confidence: float = 0.999,
         bias_walk: float | Sequence[float] = 5e-5,
         bias_move: float = 0.0,
+        largest_move: float = 0.04,
         delay_std: float = 0.001,
         gain_is_fault: bool = False,
         louder: float = math.inf,
@@ -500,6 +503,7 @@ class Sequential(Detector):
                 "confidence": confidence,
                 "bias_walk": float(walk.max()),
                 "bias_move": bias_move,
+                "largest_move": largest_move,
                 "delay_std": delay_std,
                 "gain_is_fault": gain_is_fault,
                 "louder": louder,
@@ -533,6 +537,7 @@ class Sequential(Detector):
         params["louder"] = louder
         params["rest_std"] = REST_STD
         params["bias_move"] = bias_move
+        params["largest_move"] = largest_move
         params["limit"] = self.run_length
         params["confidence"] = confidence
 

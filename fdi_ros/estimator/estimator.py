@@ -115,6 +115,7 @@ class Constants:
     nonlinearity: Channels
     rest_std: Real  # of the rate at rest, rad/s
     bias_move: Real  # of a healthy bias in flight, standard deviation, rad/s
+    largest_move: Real  # of all healthy biases together within half a minute, rad/s
     determines: Sets  # sets of channels that give a rate
     spans: Sets  # of the sets that give a rate, those with redundancy
     least: Whole  # samples that a fault lasts

@@ -34,8 +34,10 @@ class Quantity(NamedTuple):
     With 0.04 a thermal shock of 6 mrad/s names a healthy gyro in 1 of 16 flights, with 0.06
     in none, and the IMU that warms in a crash is named at 17 s and 22 s. Accelerometers: 0,
     as a fault of 0.3 m/s^2 would not be named."""
+    largest_move: float
+    """By which all healthy biases may move together within half a minute, over the natural size."""
 
 
-RATE = Quantity("gyro", "rad/s", 1.0, False, math.inf, 0.06)
+RATE = Quantity("gyro", "rad/s", 1.0, False, math.inf, 0.06, 0.04)
 #: 150 m/s^2 for 1 rad/s: then nothing is declared in thirty vibrating flights
-FORCE = Quantity("accelerometer", "m/s^2", 150.0, True, 16.0, 0.0)
+FORCE = Quantity("accelerometer", "m/s^2", 150.0, True, 16.0, 0.0, 0.6 / 150.0)

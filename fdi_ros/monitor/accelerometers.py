@@ -164,8 +164,8 @@ def lever_arms(config: Config, units: Sequence[int]) -> Array:
     return np.repeat(positions[list(units)], each, axis=0)
 
 
-def position_variance(config: Config, units: Sequence[int]) -> Array:
-    """Variance of what is unknown of the position of each accelerometer along an axis, (m,) m^2.
+def position_std(config: Config, units: Sequence[int]) -> Array:
+    """Return the standard deviation of the position of each accelerometer along an axis, (m,) m.
 
     Positions are counted from the first place, whose own is known.
     """
@@ -173,7 +173,7 @@ def position_variance(config: Config, units: Sequence[int]) -> Array:
     each = 3 if config.has_units else 1
     std = own.position_std or (0.0 if own.positions else UNKNOWN_POSITION,)
     of_units = [0.0 if unit == 0 else std[unit % len(std)] for unit in units]
-    return np.repeat(np.square(of_units), each)
+    return np.repeat(np.array(of_units), each)
 
 
 def felt_units(block: Block) -> tuple[int, ...]:

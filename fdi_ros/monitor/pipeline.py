@@ -38,7 +38,7 @@ from fdi_ros.monitor.accelerometers import (
     felt_units,
     lever_arms,
     places,
-    position_variance,
+    position_std,
     possible_names,
     possible_units,
 )
@@ -324,8 +324,8 @@ class Pipeline:
             arms = lever_arms(self.config, units)
             settings["places"][: len(arms)] = places(self.config, units)
             settings["arms"][: len(arms)], settings["lever"] = arms, arms.any()
-            variance = position_variance(self.config, units)
-            settings["position_variance"][: len(arms)] = variance
+            std = position_std(self.config, units)
+            settings["position_std"][: len(arms)] = std / FORCE.natural
             if self._in_flight:
                 other.prepare()
             self._built[units] = other

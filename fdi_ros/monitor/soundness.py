@@ -73,7 +73,7 @@ class ChannelHealth:
     noisy_from_s: float = 0.0
     """Start of that spell, s. Negative: as long before now."""
     noisy_times: float = 0.0
-    """Its largest noise in that spell, over its usual or expected noise, the smaller one."""
+    """Its mean noise in that spell, over its usual or expected noise, the smaller one."""
     measured_in: str = "rad/s"
     """Unit of its figures: rad/s of a gyro, m/s^2 of an accelerometer."""
     doubt: str = ""

@@ -51,7 +51,10 @@ class NoisySpell:
 
     since: int  #: Stamp of its first sample, ns.
     until: int  #: Stamp of its last sample so far, ns.
-    times: float  #: Largest noise over the expected or usual one, whichever is smaller.
+    samples: int  #: Number of noisy samples.
+    times: (
+        float  #: Their mean noise over the expected or usual one, whichever is smaller.
+    )
 
     @property
     def seconds(self) -> float:
@@ -59,7 +62,7 @@ class NoisySpell:
         return (self.until - self.since) / 1e9
 
 
-NEVER_NOISY = NoisySpell(0, 0, 0.0)
+NEVER_NOISY = NoisySpell(0, 0, 0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -352,8 +355,7 @@ def _channel(
 
 
 def _spell(spell: Any, i: int) -> NoisySpell:
-    since, until, times = (spell[name][i].item() for name in spell.dtype.names)
-    return NoisySpell(since, until, times)
+    return NoisySpell(*(spell[name][i].item() for name in spell.dtype.names))
 
 
 def _named(names: Sequence[str], marked: Mask) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ from fdi_ros.monitor.accelerometers import (
     accelerometer_names,
     felt_units,
     lever_arms,
-    position_variance,
+    position_std,
 )
 from fdi_ros.monitor.building import UNIT_DELAY, build_geometry
 from fdi_ros.setup.blocks import Blocks, make_blocks, prepare
@@ -318,7 +318,7 @@ def position_settings(
     for one in positions:
         taken = np.logical_or(one.measured, likely)
         known[one.unit] = np.where(taken, one.value, known[one.unit])
-    before = np.sqrt(position_variance(config, units))[::3]
+    before = position_std(config, units)[::3]
     unknown = np.where(before > 0.0, before, UNKNOWN_POSITION)
     unknown[0] = 0.0
     for one in positions:

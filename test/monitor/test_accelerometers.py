@@ -188,9 +188,8 @@ def test_positions_that_are_given_are_known_unless_their_error_is_given():
         (given | {"accelerometers__position_std": [0.0, 0.1, 0.3]}, (0.0, 0.1, 0.3)),
     ):
         pipeline = Pipeline(settings(accelerometers__enabled="on", **changes))
-        variance = pipeline.accelerometers.core["settings"]["position_variance"]
-        expected = np.repeat(np.square(expected), 3)
-        np.testing.assert_allclose(variance[0, :9], expected, rtol=1e-12)
+        std = 150.0 * pipeline.accelerometers.core["settings"]["position_std"]
+        np.testing.assert_allclose(std[0, :9], np.repeat(expected, 3), rtol=1e-12)
 
 
 def sent(block, absent=()):

@@ -76,7 +76,7 @@ def test_noise_is_reported_while_it_lasts_and_for_a_minute():
     assert verdicts[16:75] == ["LOOK"] * 59
     assert verdicts[85:] == ["HEALTHY"] * 15
     assert re.search(
-        r"imu_2.y had noise \d+ times as large as usual for \d+\.\d s, \d+ s ago",
+        r"imu_2.y had noise [\d.]+ times as large as usual for \d+\.\d s, \d+ s ago",
         lines[30].message,
     )
 
