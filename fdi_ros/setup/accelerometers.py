@@ -27,6 +27,7 @@ from fdi_ros.monitor.accelerometers import (
     accelerometer_names,
     felt_units,
     lever_arms,
+    possible_units,
 )
 from fdi_ros.monitor.building import UNIT_DELAY, build_geometry
 from fdi_ros.setup.agreement import LEAST_RESPONSE
@@ -98,30 +99,34 @@ def prepare_accelerometers(
 
     ``config``: with calibrated axes of the gyros, and with the positions.
     ``trusted``: names of units that are taken as configured. None without
-    accelerometers of two units. `CalibrationError` if they give too few values, or
-    contradict each other.
+    accelerometers of two units or of an array. `CalibrationError` if they give too few
+    values, or contradict each other.
     """
-    units = felt_units(block) if config.has_units else ()
-    if len(units) < 2 or block.acceleration is None:
+    force = block.acceleration
+    everywhere = possible_units(config, block.z.shape[1])
+    units = felt_units(block) if config.has_units else tuple(everywhere)
+    if len(units) < 2 or force is None:
         return None
-    everywhere = range(len(config.topics))
     whole, felt = (accelerometer_names(config, which) for which in (everywhere, units))
     names = tuple(name for name in felt if name not in config.excluded_channels)
     active = np.array([whole.index(name) for name in names])
     axes = nominal_axes(config)[active]
-    force = block.acceleration
     most = np.broadcast_to(config.accelerometers.max_acceleration, len(whole))[active]
     delivered = force.delivered[:, active]
     data = prepare(Block(force.stamp, force.z[:, active], delivered), most)
     _check_amount(data, names)
-    numbers, first, of = np.unique(active // 3, return_index=True, return_inverse=True)
-    _check_forces(data.z, [config.imu_names[k] for k in numbers], of, axes)
-    delay = delays_of(config, gyros)[active]
+    # All accelerometers of an array are sampled at one instant, as those of a unit are.
+    of_unit = active // 3 if config.has_units else np.zeros_like(active)
+    numbers, first, of = np.unique(of_unit, return_index=True, return_inverse=True)
+    delay = np.zeros(len(active))
+    if config.has_units:
+        _check_forces(data.z, [config.imu_names[k] for k in numbers], of, axes)
+        delay = delays_of(config, gyros)[active]
     arms = lever_arms(config, everywhere)[active]
     data.z = (data.z - _added(data, gyros, axes, arms, delay)) / FORCE.natural
     spiky = spikes(data.z, axes)
     data.z[spiky] = np.nan
-    known = [name.rpartition(".")[0] in trusted for name in names]
+    known = [config.has_units and name.rpartition(".")[0] in trusted for name in names]
     priors = Priors(
         axes=axes,
         unit=of,
@@ -136,14 +141,17 @@ def prepare_accelerometers(
 
 
 def nominal_axes(config: Config) -> Array:
-    """Return the axes (3 units, 3) of all accelerometers, as configured.
+    """Return the axes (n, 3) of all accelerometers, as configured.
 
-    Without such settings, those of the gyros, as the nearest right angles: scale factors
-    and misalignments of gyros are not those of accelerometers.
+    Without such settings, those of the gyros; of units as the nearest right angles: scale
+    factors and misalignments of gyros are not those of accelerometers.
     """
     if config.accelerometers.axes:
         return np.reshape(config.accelerometers.axes, (-1, 3))
-    u, _, v = np.linalg.svd(build_geometry(config).axes.reshape(-1, 3, 3))
+    axes = build_geometry(config).axes
+    if not config.has_units:
+        return axes
+    u, _, v = np.linalg.svd(axes.reshape(-1, 3, 3))
     return np.asarray((u @ v).reshape(-1, 3))
 
 
@@ -274,7 +282,8 @@ def _differences(found: StateEstimate, nominal: Array) -> StateEstimate:
 def _settings(config: Config, active: Int, found: StateEstimate) -> dict[str, object]:
     """Return the changed parameters."""
     own = config.accelerometers
-    n = 3 * len(config.topics)
+    axes = nominal_axes(config)
+    n = len(axes)
 
     def changed(before: Sequence[float], new: Array | float) -> list[float]:
         """Replace the values of the channels in use, and give them back with 4 digits."""
@@ -282,7 +291,7 @@ def _settings(config: Config, active: Int, found: StateEstimate) -> dict[str, ob
         values[active] = new
         return [float(f"{value:.4g}") + 0.0 for value in values]
 
-    axes = nominal_axes(config)
+    axes = axes.copy()
     axes[active] = found.axes
     scale = max(found.disagreement()[0], LEAST_SCALE_STD)
     settings: dict[str, object] = {

@@ -168,8 +168,8 @@ def calibrate(
         found = estimate(data, sensors)
         beside = _Beside(block, config, active, data.step, tuple(trusted), found)
         samples = _as_monitored(block, data, used, found, beside.ready)
-        faults, spectrum = _watch(samples, beside.config, beside.names)
         n = len(active)
+        faults, spectrum = _watch(samples, beside.config, beside.names, n)
         of_gyros = tuple(span for span in faults if min(span.channels) < n)
         of_forces = tuple(
             span._replace(channels=tuple(i - n for i in span.channels))
@@ -278,8 +278,8 @@ def _as_monitored(
     # The value of another instant is no substitute.
     received[:, used] = np.isfinite(z[:, used])
     forces = None
-    if beside is not None:
-        forces = beside.as_monitored(block.stamp, block.z.shape[1])
+    if beside is not None and block.acceleration is not None:
+        forces = beside.as_monitored(block.stamp, block.acceleration.z.shape[1])
     return Block(block.stamp, z, received, forces)
 
 
@@ -391,9 +391,12 @@ class _Watched(Kept):
 
 
 def _watch(
-    block: Block, config: Config, names: Sequence[str]
+    block: Block, config: Config, names: Sequence[str], gyros: int
 ) -> tuple[tuple[Span, ...], Spectrum]:
-    """Return the declarations of the monitor of these channels, and the spectrum."""
+    """Return the declarations of the monitor of these channels, and the spectrum.
+
+    The first ones are ``gyros``, the others accelerometers.
+    """
     # Declarations then end with their cause. What the turning of the body adds is off.
     changes: dict[str, Value] = {
         "decision.latch": False,
@@ -411,7 +414,7 @@ def _watch(
         for k, states in enumerate(state.T)
         for run in flag_runs(states == ChannelState.FAULTY)
     ]
-    of_forces = np.array([".accel_" in name for name in names])
+    of_forces = np.arange(len(names)) >= gyros
     for half in (~of_forces, of_forces):
         doubted = np.asarray((among & half).any(axis=1))
         runs += [

@@ -91,7 +91,7 @@ NOISE_HINT = (
 )
 FORCE_HINT = (
     "Differences from what all accelerometers have in common, which is not seen; with standard errors (+-). The axes"
-    " of the gyros, at right angles, are nominal."
+    " of the gyros, of units at right angles, are nominal."
 )
 BIAS_HINT = "Estimate over the recording, minus the mean of each channel. The common part is observable only at rest."
 

@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from vehicles import forces_of, vehicle
+from monitor.streams import SIGMA
+from monitor.test_accelerometers import CONE, NOISE, array_settings
+from vehicles import START, forces_of, vehicle
 
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
@@ -73,6 +75,37 @@ def test_what_is_written_is_taken_by_the_monitor_and_nothing_healthy_is_declared
     two = accelerometer_config(config, (0, 2))
     assert two.bias.fixed == derived.bias.fixed[:3] + derived.bias.fixed[6:]
     np.testing.assert_array_equal(build_geometry(two).axes, axes[[0, 1, 2, 6, 7, 8]])
+
+
+def test_an_array_of_accelerometers_is_calibrated_beside_its_gyros():
+    """Six and six on one cone, with errors of 0.2 m/s^2 and 0.5 %."""
+    one = vehicle(1, "flight with rest")
+    random = np.random.default_rng(3)
+    block = forces_of(one, np.zeros((1, 3))).block
+    axes = CONE + random.normal(0.0, 0.005, CONE.shape)
+    bias = random.normal(0.0, 0.2, 6)
+    truth = block.acceleration.z @ np.linalg.inv(one.axes[:3]).T
+    rate = one.motion.rate_at((block.stamp - START) * 1e-9)
+    samples = (len(block), 6)
+    block = Block(
+        block.stamp,
+        rate @ CONE.T + random.normal(0.0, SIGMA, samples),
+        None,
+        Block(block.stamp, truth @ axes.T + bias + random.normal(0.0, NOISE, samples)),
+    )
+    config = array_settings()
+    result = calibrate(block, config)
+    fit = result.accelerometers
+    assert fit.names == ("a1", "a2", "a3", "a4", "a5", "a6")
+    apart = projector(fit.axes)
+    ratio = (fit.estimate.bias - apart @ bias) / fit.bias_std
+    assert np.abs(ratio).max() < 4.0
+    assert fit.bias_std.max() < 0.05
+    of_axes = fit.axes - (fit.nominal + apart @ (axes - fit.nominal))
+    assert np.abs(of_axes / fit.axes_std).max() < 4.0
+    np.testing.assert_allclose(fit.estimate.floor.std, NOISE, rtol=0.1)
+    pipeline = Pipeline(config.replaced(result.settings))
+    assert not [one for one in pipeline.process(block).events if one.declares]
 
 
 def test_a_common_error_is_not_seen_and_the_report_states_that():
