@@ -50,7 +50,8 @@ MONITOR_LATE = "the monitor is late"
 SIZING = 200 * MS  #: Longest wait of a text for the size of an error, ns.
 COUNTED = 5 * NS  #: Losses are counted over this time, ns.
 STEADY = 3 * NS  #: Readiness must have changed for this time to be announced, ns.
-BOOT_STEP = 3 * NS  #: A boot time that grows by more is another boot, ns.
+BOOT_STEP = 3 * NS  #: A boot time that grows by more is another boot, ns,
+BACKLOG = 10 * NS  #: if the autopilot's time has gone back, or after this time, ns.
 SAME_BOOT = 10.0  #: Largest difference of two times of one start of the autopilot, s.
 #: Two starts within this time are those of one power supply, s.
 POWERED_TOGETHER = 60.0
@@ -102,6 +103,8 @@ class Failover:
         self._conversation = 0
         self._boots = 0
         self._booted: int | None = None  # when the autopilot started, ns
+        self._restarts = 0  # steps of the autopilot's time found until then
+        self._late_since: int | None = None  # messages are late, or after a boot, since
         self._read_at = -NS
         self._hurry = False
         self._unsized: dict[int, int] = {}  # IMUs out of use, not announced yet: since
@@ -121,8 +124,7 @@ class Failover:
         """Whether a stop now leaves nothing to put back: in flight, IMUs stay out."""
         pairs = zip(self._state.memories, self.evidence.imus, strict=True)
         waits = any(
-            memory.ours and imu.named is False and not memory.without_notch
-            for memory, imu in pairs
+            memory.ours and imu.ok and not memory.without_notch for memory, imu in pairs
         )
         return self._vehicle.armed or not self._vehicle.in_reach or not waits
 
@@ -192,18 +194,25 @@ class Failover:
         return (Level.WARN, f"no failover: {why}") if why else (Level.OK, "ready")
 
     def _note_boot(self, now: int) -> None:
-        """Note a start of the autopilot: its clock is behind."""
+        """Note a start of the autopilot: its clock has gone back, or is behind for long."""
         tracks = self._vehicle.units.values()
         newest = max(tracks, key=lambda track: track.last, default=None)
         if newest is None:
             return
         booted = newest.last - newest.time
+        restarts = self._vehicle.clock.restarts
         if self._booted is None and self.out:
             if not self._is_same_boot((now - booted) / NS):
                 self._boots += 1
         elif self._booted is not None and booted - self._booted > BOOT_STEP:
+            # A link that was blocked also delivers late what it has kept.
+            self._late_since = self._late_since or now
+            if restarts == self._restarts and now - self._late_since < BACKLOG:
+                return
             self._boots += 1
             self._forget()
+        self._late_since = None
+        self._restarts = restarts
         self._booted = booted
 
     def _is_same_boot(self, ago: float) -> bool:
@@ -264,6 +273,7 @@ class Failover:
             linked=vehicle.in_reach
             and vehicle.autopilot == ARDUPILOT
             and vehicle.kind == "SCALED_IMU"
+            and self._late_since is None
             and is_same,
             armed=vehicle.armed,
             disarmed=vehicle.disarmed,
@@ -296,7 +306,7 @@ class Failover:
         vehicle = self._vehicle
         at, lost, received = self._counted
         if now - at >= COUNTED:
-            self._counted = (now, vehicle.counts["lost"], vehicle.counts["messages"])
+            self._counted = (now, vehicle.counts["lost"], vehicle.counts["in use"])
             more = self._counted[1] - lost
             self._lost = more / max(1, more + self._counted[2] - received)
         why = self._not_ready(view, now)
@@ -322,31 +332,33 @@ class Failover:
             bad = imu._replace(blamed=True, size=math.inf, delivers=True)
             trial = view._replace(armed=True, imus=(*imus[:k], bad, *imus[k + 1 :]))
             against.append(objection(k, memories, trial, now, self._settings))
-        reasons = [
-            why for why, imu in zip(against, view.imus, strict=True) if why and imu.use
-        ]
-        if not any(imu.use for imu in view.imus):
-            reasons = against[:1]
-        for name, memory, imu in zip(names, memories, view.imus, strict=True):
-            apart = is_apart(imu, self._settings)
-            checks = (
-                (memory.without_notch, "reboot before flight"),
-                (imu.use and imu.blamed, "faulty and in use"),
-                (imu.use and apart, "differs and is in use"),
-                (imu.use is False, "not in use"),
-                (imu.use and not imu.delivers, "sends nothing"),
-                (imu.use and not memory.acquainted, "not seen to agree yet"),
-            )
-            reasons += [f"{name} {words}" for holds, words in checks if holds]
-        trip = self._vehicle.sync.error(now)
-        links = (
+        trip = self._vehicle.sync.trip(now)
+        checks = [
             (not self.age <= LATE, MONITOR_LATE),
             (self._lost > LOSSY, "link loses messages"),
             (self._is_slow(view, now), "IMUs come too slowly"),
-            (trip is not None and 2 * trip > SLOW, "link is slow"),
-        )
-        reasons += [words for holds, words in links if holds]
-        return reasons[0] if reasons else ""
+            (trip is None or trip > SLOW, "link is slow"),
+        ]
+        checks += [
+            (bool(why and imu.use), why)
+            for why, imu in zip(against, view.imus, strict=True)
+        ]
+        checks += [(not any(imu.use for imu in view.imus), against[0])]
+        for name, memory, imu in zip(names, memories, view.imus, strict=True):
+            apart = is_apart(imu, self._settings)
+            checks += [
+                (memory.without_notch, "reboot before flight"),
+                (imu.use is None, f"use of {name} is not reported"),
+                (imu.use is False, f"{name} not in use"),
+                (imu.blamed, f"{name} faulty and in use"),
+                (apart, f"{name} differs and is in use"),
+                (not imu.delivers, f"{name} sends nothing"),
+                (not memory.acquainted, f"{name} not seen to agree yet"),
+                (imu.agreed is None, f"{name} agrees with none"),
+                (not imu.judged, f"{name} is not judged"),
+            ]
+        checks += [(len(names) < 3, "two IMUs: no third to decide")]
+        return next((words for holds, words in checks if holds and words), "")
 
     def _is_slow(self, view: View, now: int) -> bool:
         """Return whether an IMU in use comes so slowly that vibration may look like an error."""

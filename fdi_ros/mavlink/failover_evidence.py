@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +31,8 @@ CURRENT = 500 * MS  #: Oldest pair of samples that still counts, ns.
 #: for `HEALED`, only the present size counts.
 DECAY = 0.5
 HEALED = NS // 2  #: Time of agreement after which an earlier size is forgotten, ns.
-LASTING = 300 * MS  #: A set must stand for this time to name an IMU, ns.
+LASTING = 300 * MS  #: A set must stand for this time to name an IMU, ns,
+GAP = 200 * MS  #: without a break longer than this, ns.
 VOTE = 2.0  #: Least error of the odd one in a set of several IMUs, in ``min_size``.
 LARGE = 0.3  #: Difference from which any doubt of the monitor names the odd IMU, rad/s.
 #: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
@@ -40,9 +41,14 @@ CLEAR = 0.5
 #: Share of the rate by which two healthy gyros may differ: scales of one type differ by up
 #: to 3 %, which is more than `CLEAR` in a turn of 17 rad/s.
 SCALE = 0.05
-#: An error is no oscillation if its mean is this share of its standard deviation. A mean of
-#: 120 ms leaves less of a vibration faster than 11 Hz.
-STEADY = 1 / 3
+#: An error is no oscillation if its mean is this share of its standard deviation: a mean of
+#: 120 ms leaves less of vibration that seems faster than 5 Hz.
+STEADY = 1.0
+#: An IMU that the monitor doubts agrees only while the difference scatters by less, rad/s,
+CALM = 0.1
+#: and once another one has turned by this, rad/s: a dead gyro agrees with one at rest.
+TURNING = 0.1
+WILD = 1.0  #: An oscillation with this standard deviation is an error, rad/s.
 SKEW = 20 * MS  #: Two IMUs may measure this far apart in time, ns.
 #: The last samples must all differ by `LARGE` or `CLEAR`: those of at least this time,
 #: ns, and at least `FEWEST` of them.
@@ -52,10 +58,13 @@ SIZED = 80 * MS  #: The size in a text is averaged over this time, ns.
 WHOLE = 0.5  #: Share of the largest axis from which a second one is off as well.
 ALIKE = 0.05  #: Two IMUs agree within this share of the odd one's difference, too.
 TRUSTED = 2 * NS  #: IMUs are trusted after all have agreed for this time, ns.
-#: A gyro is stuck if it repeats one value for this time, ns, while the rate of another
-#: gyro changes by `MOVED`.
+#: A gyro is stuck if it repeats one value for this time, ns, while the rates of two others
+#: change by `MOVED`, or the rate of one by this and `NOISE` standard deviations: a bad gyro
+#: scatters also at rest.
 REPEATING = 100 * MS
 MOVED = 0.02  #: Change of rate that proves a motion, rad/s.
+NOISE = 4.0
+ENDS = 4  #: Samples averaged at the begin and at the end of that time.
 #: States of channels that are a doubt.
 DOUBTS = {
     ChannelState.SUSPECT,
@@ -63,6 +72,8 @@ DOUBTS = {
     ChannelState.FAULTY,
     ChannelState.STALE,
 }
+#: States of channels of which a fault would not be seen.
+UNJUDGED = {ChannelState.UNCHECKED, ChannelState.EXCLUDED, ChannelState.STALE}
 CERTAIN = 5.0  #: Standard deviations from which a size is known.
 SILENT = NS // 2  #: An IMU without samples for this time does not deliver, ns.
 FORGOTTEN = 5 * NS  #: Older states of the monitor are unknown, ns.
@@ -75,11 +86,11 @@ Apart = dict[tuple[int, int], Vector]
 
 
 class Difference(NamedTuple):
-    """Rate of one IMU less the rate of another, averaged over `AVERAGED`."""
+    """Rate of one IMU less the rate of another, averaged."""
 
     mean: Vector  #: rad/s
+    spread: Vector  #: Standard deviation of one difference, rad/s.
     std: Vector  #: Standard deviation of the mean, rad/s.
-    spread: Vector  #: Standard deviation of one difference, rad/s. 0: not known.
 
     @property
     def size(self) -> float:
@@ -96,38 +107,42 @@ class RawComparison:
         Number of IMUs.
     interval
         Time between two samples of an IMU, ns. Samples of two IMUs form a pair if
-        their stamps differ by less than 0.4 intervals.
+        their stamps differ by less than 0.4 intervals. Faster samples are left out.
     """
 
     def __init__(self, count: int, interval: int) -> None:
         self._reach = 2 * interval // 5
+        self._shortest = 3 * interval // 4
+        self._longest = 7 * interval // 5
         self._lag = max(1, SKEW // interval)
+        self._averaged = max(1, AVERAGED // interval)
         self._last: list[tuple[int, Vector]] = [(-NS, UNKNOWN)] * count
         self._recent: list[deque[Vector]] = [deque(maxlen=KEPT) for _ in range(count)]
         self._pairs: dict[tuple[int, int], deque[tuple[int, Vector]]] = {
             (j, k): deque(maxlen=256) for k in range(count) for j in range(k)
         }
-        # Samples since the value of an IMU changed, and the rates of all IMUs then.
+        # Samples since the value of an IMU changed, and the rates of all IMUs at first.
         self._same = [0] * count
-        self._repeating = REPEATING // interval
+        self._repeating = max(FEWEST, REPEATING // interval)
         self._beside = [[UNKNOWN] * count] * count
         self._stuck = [False] * count
 
     def feed(self, unit: int, stamp: int, rate: Vector) -> None:
         """Take a sample of an IMU, from 0: stamp in ns, rate in rad/s."""
-        if unit >= len(self._last):
+        if unit >= len(self._last) or stamp - self._last[unit][0] < self._shortest:
             return
         if rate != self._last[unit][1]:
             self._same[unit] = 0
-            self._beside[unit] = [last for _, last in self._last]
             self._stuck[unit] = False
         self._same[unit] += 1
+        if self._same[unit] <= 2:
+            # At the second, the others have delivered theirs of the first.
+            self._beside[unit] = [last for _, last in self._last]
         self._last[unit] = stamp, rate
         self._recent[unit].append(rate)
-        for other, beside in enumerate(self._beside):
-            moved = math.dist(rate, beside[unit]) > MOVED
-            if other != unit and self._same[other] >= self._repeating and moved:
-                self._stuck[other] = True
+        for other, same in enumerate(self._same):
+            if other != unit and same >= self._repeating and not self._stuck[other]:
+                self._stuck[other] = self._is_left_behind(other)
         for pair, rows in self._pairs.items():
             if unit not in pair:
                 continue
@@ -138,9 +153,34 @@ class RawComparison:
             while rows and rows[0][0] <= stamp - AVERAGED:
                 rows.popleft()
 
+    def _is_left_behind(self, unit: int) -> bool:
+        """Return whether other IMUs have moved since an IMU repeats one value."""
+        moved = [
+            k
+            for k, (_, rate) in enumerate(self._last)
+            if k != unit and math.dist(rate, self._beside[unit][k]) > MOVED
+        ]
+        if len(moved) > 1:
+            return True
+        return any(self._has_turned(k, self._same[unit]) for k in moved)
+
+    def _has_turned(self, unit: int, count: int) -> bool:
+        """Return whether the rate of an IMU has changed by more than its noise.
+
+        From the first to the last `ENDS` of its last count samples.
+        """
+        # The oldest may be from before: IMUs are fed in turn.
+        rates = np.array(list(self._recent[unit])[2 - count :])
+        if len(rates) < 2 * ENDS:
+            return False
+        noise = np.std(np.diff(rates, axis=0)) / math.sqrt(ENDS)
+        change = rates[-ENDS:].mean(axis=0) - rates[:ENDS].mean(axis=0)
+        return bool(np.linalg.norm(change) > MOVED + NOISE * noise)
+
     def rate(self, unit: int) -> float:
-        """Return the size of the last rate of an IMU, rad/s."""
-        return math.hypot(*self._last[unit][1])
+        """Return the largest rate of an IMU within `AVERAGED`, rad/s."""
+        rates = list(self._recent[unit])[-self._averaged :]
+        return max(math.hypot(*rate) for rate in rates) if rates else math.nan
 
     def is_stuck(self, unit: int) -> bool:
         """Return whether an IMU has repeated one value while another one moved."""
@@ -170,38 +210,41 @@ class RawComparison:
         0 where the differences do not all have the same sign. NaN: fewer are known at
         time now, ns.
         """
-        rows = self._latest(unit, other, count, now)
-        if rows is None:
+        rows = self._rows(unit, other, now)
+        if len(rows) < count:
             return UNKNOWN
-        x, y, z = (_steady(column) for column in zip(*rows, strict=True))
+        columns = zip(*(row for _, row in rows[-count:]), strict=True)
+        x, y, z = map(_steady, columns)
         return x, y, z
 
     def between(
         self, unit: int, other: int, now: int, last: int = 0
     ) -> Difference | None:
-        """Return the difference of two IMUs at time now, ns, or None without recent pairs.
+        """Return the difference of two IMUs at time now, ns, or None if not known.
+
+        Not known: no recent pairs, or only such that are too far apart in time to show
+        an oscillation.
 
         last: number of samples averaged. 0: all within `AVERAGED`.
         """
-        rows = self._latest(unit, other, last, now)
-        if rows is None:
+        rows = self._rows(unit, other, now)[-last:]
+        stamps = [stamp for stamp, _ in rows]
+        gaps = [after - before for before, after in pairwise(stamps)]
+        if not gaps or len(rows) < last or min(gaps) > self._longest:
             return None
-        count = len(rows)
-        mean = np.mean(rows, axis=0)
-        spread = np.std(rows, axis=0, ddof=min(1, count - 1))
-        # With one pair nothing is known of the noise.
-        std = spread / math.sqrt(count) if count > 1 else np.full(3, math.inf)
-        return Difference(*(tuple(row.tolist()) for row in (mean, std, spread)))
+        values = np.array([difference for _, difference in rows])
+        mean = values.mean(axis=0)
+        spread = values.std(axis=0, ddof=1)
+        std = spread / math.sqrt(len(rows))
+        return Difference(*(tuple(row.tolist()) for row in (mean, spread, std)))
 
-    def _latest(
-        self, unit: int, other: int, count: int, now: int
-    ) -> list[Vector] | None:
-        """Return the last count differences of two IMUs, all of late if 0, or None."""
-        rows = list(self._pairs[min(unit, other), max(unit, other)])[-count:]
-        if not rows or len(rows) < count or now - rows[-1][0] > CURRENT:
-            return None
+    def _rows(self, unit: int, other: int, now: int) -> list[tuple[int, Vector]]:
+        """Return times and differences of late of two IMUs. Empty: none is recent."""
+        rows = list(self._pairs[min(unit, other), max(unit, other)])
+        if not rows or now - rows[-1][0] > CURRENT:
+            return []
         sign = 1.0 if unit < other else -1.0
-        return [(sign * x, sign * y, sign * z) for _, (x, y, z) in rows]
+        return [(at, (sign * x, sign * y, sign * z)) for at, (x, y, z) in rows]
 
 
 def _steady(values: Sequence[float]) -> float:
@@ -230,8 +273,12 @@ class Evidence:
         self.begun = 0  #: Time from which states have come without a break, ns.
         self.raw = RawComparison(count, interval)
         self.imus: tuple[Imu, ...] = (Imu(),) * count
-        #: Raw difference of each IMU to the nearest other one now, rad/s. NaN: unknown.
-        self.apart = [math.nan] * count
+        # Difference of each pair, and a bound on it with oscillations.
+        self._apart: Apart = {}
+        self._bound: Apart = {}
+        # The same of each IMU and the nearest other one now, rad/s. NaN: unknown.
+        self._nearby = [math.nan] * count
+        self._bounded = [math.nan] * count
         self._min_size = min_size
         self._fewest = max(FEWEST, QUICK // interval + 1)
         self._sized = SIZED // interval
@@ -246,8 +293,12 @@ class Evidence:
         self._named_at = [0] * count
         self._outdated: list[set[int]] = [set()] * count
         self._together: int | None = None  # since when all IMUs agree, ns
+        # Since when each IMU agrees with another, ns, and agrees with one that has turned.
+        self._agreed: list[int | None] = [None] * count
+        self._turned: list[int | None] = [None] * count
         self._odd = -1  # the IMU that is bad without a name, or -1
         self._odd_since = 0
+        self._odd_seen = 0
         self._looked = 0
 
     def hear(self, states: Sequence[float], now: int) -> None:
@@ -274,27 +325,31 @@ class Evidence:
         if now - self.heard >= FORGOTTEN:
             self._states = [()] * len(delivers)
         units = [k for k, does in enumerate(delivers) if does]
-        apart = self._compare(units, now)
-        self._note_trust(units, apart, now)
-        odd, axes, lasting = self._odd_one(units, apart, now)
-        if odd != self._odd:
+        self._compare(units, now)
+        self._note_trust(units, now)
+        odd, axes, lasting = self._odd_one(units, now)
+        if odd == self._odd:
+            self._odd_seen = now
+        elif odd >= 0 or now - self._odd_seen > GAP:
             self._odd = odd
-            self._odd_since = now
+            self._odd_since = self._odd_seen = now
         if now - self._odd_since < lasting:
             odd = -1
         partners = {k: self._partners(k, units, out) for k in units}
         nearest = [
-            self._nearest(k, partners.get(k, []), apart) for k in range(len(delivers))
+            self._nearest(k, partners.get(k, []), self._apart)
+            for k in range(len(delivers))
         ]
-        self.apart = [max(vector) for vector in nearest]
+        self._nearby = [max(vector) for vector in nearest]
+        self._bounded = [
+            max(self._nearest(k, partners.get(k, []), self._bound))
+            for k in range(len(delivers))
+        ]
         held = math.exp(-(now - self._looked) / NS / DECAY)
         self._looked = now
         imus = []
         for k, vector in enumerate(nearest):
-            agrees = any(self._agree(k, j, apart) for j in partners.get(k, []))
-            if k in out and self._is_contradicted(k, partners.get(k, []), apart):
-                agrees = False
-            agreed = (self.imus[k].agreed or now) if agrees else None
+            agreed = self._note_agreement(k, partners.get(k, []), k in out, now)
             if agreed is None or now - agreed < HEALED:
                 before = [held * size for size in self._sizes[k]]
                 x, y, z = map(max, vector, before)
@@ -302,14 +357,8 @@ class Evidence:
             self._sizes[k] = vector
             faulty = self._axes(k, ChannelState.FAULTY)
             accused = faulty | axes if k == odd else faulty
-            named = faulty | self._axes(k, ChannelState.AMBIGUOUS)
-            if agreed is None or named != self._named[k]:
-                self._named[k] = named
-                self._named_at[k] = now
-            elif now - self._named_at[k] >= TRUSTED:
-                self._outdated[k] = named
-            self._outdated[k] = self._outdated[k] & named
-            if not self._is_odd(k, units, apart):
+            self._note_names(k, agreed, now)
+            if not self._is_odd(k, units):
                 accused = accused - self._outdated[k]
             is_unknown = not self._states[k] and k != odd
             stuck = self.raw.is_stuck(k)
@@ -322,42 +371,80 @@ class Evidence:
                     stuck=stuck,
                     size=max(vector),
                     agreed=agreed,
+                    judged=any(state not in UNJUDGED for state in self._states[k]),
                 )
             )
         self.imus = tuple(imus)
         return self.imus
 
-    def _compare(self, units: Sequence[int], now: int) -> Apart:
-        """Return by how much each pair differs, by axis, rad/s.
+    def bound(self, unit: int) -> float:
+        """Return a bound on the difference of an IMU to the nearest other one now, rad/s."""
+        return self._bounded[unit]
 
-        Less what scales explain. 0 for what a mean leaves of an oscillation.
+    def _compare(self, units: Sequence[int], now: int) -> None:
+        """Note by how much each pair differs, by axis, rad/s, less what scales explain.
+
+        First the steady part of the difference, and a wild oscillation: 0 for what a
+        mean leaves of another one. Then a bound that two that agree keep: the mean, or
+        the scatter from `CALM` on.
         """
-        found: Apart = {}
         for j, k in combinations(units, 2):
             difference = self.raw.between(j, k, now)
-            if difference is None:
-                found[j, k] = found[k, j] = UNKNOWN
-                continue
-            scale = SCALE * min(self.raw.rate(j), self.raw.rate(k))
-            x, y, z = (
-                max(0.0, abs(mean) - scale) if abs(mean) >= STEADY * spread else 0.0
-                for mean, spread in zip(difference.mean, difference.spread, strict=True)
-            )
-            found[j, k] = found[k, j] = x, y, z
-        return found
+            sizes = [math.nan] * 3
+            bound = [math.nan] * 3
+            if difference is not None:
+                quick = self.raw.steady(j, k, self._fewest, now)
+                scale = SCALE * min(self.raw.rate(j), self.raw.rate(k))
+                for axis, mean in enumerate(difference.mean):
+                    spread = difference.spread[axis]
+                    size = max(0.0, abs(mean) - scale)
+                    is_wild = math.hypot(mean, spread) >= WILD + scale
+                    is_steady = (
+                        abs(mean) >= STEADY * spread or abs(quick[axis]) >= LARGE
+                    )
+                    sizes[axis] = size if is_steady else WILD if is_wild else 0.0
+                    bound[axis] = max(size, spread if spread >= CALM else 0.0)
+            for pair in ((j, k), (k, j)):
+                self._apart[pair] = sizes[0], sizes[1], sizes[2]
+                self._bound[pair] = bound[0], bound[1], bound[2]
 
-    def _note_trust(self, units: Sequence[int], apart: Apart, now: int) -> None:
+    def _note_trust(self, units: Sequence[int], now: int) -> None:
         """Note whether all IMUs agree, and which are apart from all others."""
         pairs = list(combinations(units, 2))
         stuck = any(map(self.raw.is_stuck, units))
-        agree = pairs and all(max(apart[pair]) < self._min_size for pair in pairs)
+        agree = pairs and all(max(self._bound[pair]) < self._min_size for pair in pairs)
         self._together = (self._together or now) if agree and not stuck else None
         for k in units:
-            own = [max(apart[k, j]) for j in units if j != k]
+            own = [max(self._apart[k, j]) for j in units if j != k]
             if self._together is not None and now - self._together >= TRUSTED:
                 self._refuted[k] = self._doubts(k)
             elif all(size >= self._min_size for size in own):
                 self._refuted[k] = None
+
+    def _note_agreement(
+        self, unit: int, partners: Sequence[int], is_out: bool, now: int
+    ) -> int | None:
+        """Return since when an IMU agrees with another, ns, or None."""
+        doubted = bool(self._doubts(unit))
+        agreeing = [k for k in partners if self._agree(unit, k, doubted)]
+        if not agreeing or (is_out and self._is_contradicted(unit, partners)):
+            self._agreed[unit] = self._turned[unit] = None
+        else:
+            self._agreed[unit] = self._agreed[unit] or now
+            if max(map(self.raw.rate, agreeing)) >= TURNING:
+                self._turned[unit] = self._turned[unit] or now
+        return self._turned[unit] if doubted else self._agreed[unit]
+
+    def _note_names(self, unit: int, agreed: int | None, now: int) -> None:
+        """Note which axes were named before the IMU has agreed for long."""
+        named = self._axes(unit, ChannelState.FAULTY)
+        named |= self._axes(unit, ChannelState.AMBIGUOUS)
+        if agreed is None or named != self._named[unit]:
+            self._named[unit] = named
+            self._named_at[unit] = now
+        elif now - self._named_at[unit] >= TRUSTED:
+            self._outdated[unit] = named
+        self._outdated[unit] &= named
 
     def _doubts(self, unit: int) -> set[ChannelState]:
         return DOUBTS.intersection(self._states[unit])
@@ -386,28 +473,29 @@ class Evidence:
             return UNKNOWN
         return min(found, key=max)
 
-    def _agree(self, unit: int, other: int, apart: Apart) -> bool:
-        """Return whether an IMU agrees with a partner that is sound."""
-        is_sound = self.apart[other] < self._min_size or set(self._states[other]) == {
-            ChannelState.OK
-        }
-        is_stuck = self.raw.is_stuck(unit) or self.raw.is_stuck(other)
-        return is_sound and not is_stuck and max(apart[unit, other]) < self._min_size
+    def _agree(self, unit: int, other: int, doubted: bool) -> bool:
+        """Return whether an IMU agrees with a partner that is sound.
 
-    def _is_contradicted(
-        self, unit: int, partners: Sequence[int], apart: Apart
-    ) -> bool:
+        doubted: by the monitor. Then an oscillation counts against it.
+        """
+        is_ok = set(self._states[other]) == {ChannelState.OK}
+        is_sound = is_ok or self._nearby[other] < self._min_size
+        is_stuck = self.raw.is_stuck(unit) or self.raw.is_stuck(other)
+        sizes = (self._bound if doubted else self._apart)[unit, other]
+        return is_sound and not is_stuck and max(sizes) < self._min_size
+
+    def _is_contradicted(self, unit: int, partners: Sequence[int]) -> bool:
         """Return whether an IMU differs from a partner that the monitor does not name.
 
         Two IMUs that fail alike agree with each other, but not with the third.
         """
         return any(
-            max(apart[unit, k]) >= self._min_size
+            max(self._apart[unit, k]) >= self._min_size
             and not self._axes(k, ChannelState.FAULTY)
             for k in partners
         )
 
-    def _is_odd(self, unit: int, units: Sequence[int], apart: Apart) -> bool:
+    def _is_odd(self, unit: int, units: Sequence[int]) -> bool:
         """Return whether the two other IMUs agree, and nothing is against these two.
 
         They are trusted, their values change, and every doubt that the monitor has of
@@ -416,8 +504,10 @@ class Evidence:
         others = [k for k in units if k != unit]
         if len(others) != 2 or unit not in units:
             return False
-        size = min(max(apart[unit, k]) for k in others)
-        if not max(apart[others[0], others[1]]) < max(self._min_size, ALIKE * size):
+        size = min(max(self._apart[unit, k]) for k in others)
+        if not max(self._bound[others[0], others[1]]) < max(
+            self._min_size, ALIKE * size
+        ):
             return False
         for k in others:
             refuted = self._refuted[k]
@@ -427,9 +517,7 @@ class Evidence:
                 return False
         return True
 
-    def _odd_one(
-        self, units: Sequence[int], apart: Apart, now: int
-    ) -> tuple[int, set[int], int]:
+    def _odd_one(self, units: Sequence[int], now: int) -> tuple[int, set[int], int]:
         """Return an IMU that is bad although the monitor does not name it.
 
         Also return its axes, and for how long this must last before it counts, ns.
@@ -441,11 +529,11 @@ class Evidence:
         fail alike put the healthy third one into a set.
         """
         for k in units:
-            if not self._is_odd(k, units, apart):
+            if not self._is_odd(k, units):
                 continue
             if axes := self._clear_axes(k, units, now):
                 return k, axes, 0
-            sizes = [apart[k, j] for j in units if j != k]
+            sizes = [self._apart[k, j] for j in units if j != k]
             axes = {
                 axis
                 for axis in self._axes(k, ChannelState.AMBIGUOUS)
@@ -496,7 +584,7 @@ class Evidence:
         ]
         if not found:
             return None
-        mean, std, _ = min(found)[2]
+        mean, _, std = min(found)[2]
         axis = max(range(3), key=lambda k: abs(mean[k]))
         others = [abs(mean[k]) for k in range(3) if k != axis]
         if max(others) > WHOLE * abs(mean[axis]):

@@ -15,7 +15,8 @@ Definitions
     blamed   named on an axis that is apart. A name from before the IMU last agreed counts
              only while two of three IMUs agree, and this one does not
     bad      blamed, and delivers. Else left in use.
-    sound    delivers, and the monitor finds it OK or it is not apart
+    alive    delivers samples, and they change while other IMUs turn
+    sound    alive, and the monitor finds it OK or it is not apart
     ours     out of use by our order, or perhaps so: from the moment the order is sent
              until the autopilot reports "in use" `SETTLED` after it
     seen     INS_USE as reported. A change that we have not ordered counts once it has
@@ -26,12 +27,13 @@ Definitions
 `failover_evidence.Evidence` finds which IMUs are apart, named and blamed.
 
 Rules, in this order at each tick
-    1. A held IMU goes back in use in three cases: the operator asks; every other IMU is
-       stuck or out of use; or the IMU has not been apart for a pause. The pause is
-       `PAUSE`, doubled each time the IMU is taken out in one flight. In flight the
-       third case needs a live monitor. On the ground the IMU stays out while the
-       monitor names it or does not report. An IMU that was out when the autopilot
-       started has no notch filters: only the operator or rule 4 puts it back.
+    1. A held IMU goes back in use if the operator asks; if every other IMU is dead or out
+       of use; or if the IMU has not been apart for a pause. The pause is `PAUSE`, doubled
+       each time the IMU is taken out in one flight. In flight the last case needs a live
+       monitor, and an IMU that the monitor finds OK goes back at once if all that are in
+       use are bad. On the ground the IMU stays out until the monitor finds it OK. An IMU
+       that was out when the autopilot started has no notch filters: only the operator or
+       rule 4 puts it back.
     2. In flight, the worst bad IMU to which `objection` has nothing becomes held. At
        most ``limit`` IMUs are ours, without a limit all but one.
     3. Orders are sent until the autopilot reports the wanted state. An order to take an
@@ -85,16 +87,19 @@ class Condition(Enum):
     DANGER = "bad, in use, armed"
     OUT = "out of use by our order, armed"
     STAYS_OUT = "out of use by our order on the ground, because it is still named"
-    UNREPORTED = "out of use by our order on the ground, without reports of the monitor"
-    REBOOT = "was out of use when the autopilot started: no notch filters"
+    NOT_OK = "out of use by our order on the ground, not named and not found OK"
+    REBOOT = (
+        "on the ground, was out of use when the autopilot started: no notch filters"
+    )
     STUCK_OUT = "ordered back, but not reported in use"
     LEFT_ALONE = "set by somebody else in this flight, or put back by the operator"
+    UNUSED = "out of use, and not by our order"
     APART = "apart for long, while two others agree"
     DISAGREE = "an IMU is apart for long, armed, and the monitor finds none OK"
-    ALONE = "one IMU or none is alive, armed"
-    REDUNDANT = "two or more IMUs in use, and EKF lanes that are not lost"
+    ALONE = "one IMU is alive, or none but samples arrive, armed"
+    REDUNDANT = "two or more IMUs in use that agree, and EKF lanes that are not lost"
     LAST_IMU = "one IMU in use, or none, because of our orders"
-    LAST_LANE = "one EKF lane, or none, is not lost"
+    LAST_LANE = "one EKF lane, or none, is not lost, armed"
 
 
 #: Announced every `REPEAT`.
@@ -124,6 +129,7 @@ class Imu(NamedTuple):
     ok: bool = False  #: The monitor finds all its channels OK.
     delivers: bool = False  #: Its samples arrive.
     stuck: bool = False  #: They repeat one value while another IMU moves.
+    judged: bool = True  #: The monitor judges at least one of its channels.
     size: float = float("nan")
     """Largest raw difference to the nearest IMU of late, rad/s. NaN: unknown."""
     #: Not apart from a sound IMU since this time. None: apart, stuck or unknown.
@@ -279,10 +285,10 @@ def decide(
             memory.seen = memory.against_since = None
             memory.lane_angle = 0.0
             memory.tries = 0
-            memory.held = memory.without_notch = memory.ours
+            memory.held = memory.without_notch = memory.ours  # until reported in use
         _remember(memory, imu, view, now, settings)
     _note_lanes(memories, view, now - state.at, settings)
-    _release(memories, view, now)
+    _release(memories, view, now, settings)
     _hold_worst(memories, view, now, settings)
     orders = []
     for k, memory in enumerate(memories):
@@ -302,6 +308,8 @@ def decide(
         is_fine = condition is Condition.FINE
         if is_fine and not view.imus[key].size < settings.min_size:
             # Off, but not for long, or nobody is the odd one, or unknown.
+            continue
+        if condition is Condition.REDUNDANT and not _is_redundant(memories, view):
             continue
         usual = Condition.REDUNDANT if key == VEHICLE else Condition.FINE
         last = announced.get(key, Announced(usual, now))
@@ -338,7 +346,8 @@ def _remember(
         _hear(memory, imu.use, imu.heard)
     if imu.agreed is not None and now - imu.agreed >= ACQUAINTED:
         memory.acquainted = True
-    memory.bad_since = (memory.bad_since or now) if is_bad(imu, settings) else None
+    is_danger = view.armed and is_bad(imu, settings)
+    memory.bad_since = (memory.bad_since or now) if is_danger else None
     is_off = is_apart(imu, settings)
     memory.apart_since = (memory.apart_since or now) if is_off else None
     memory.dead_since = None if is_alive(imu) else (memory.dead_since or now)
@@ -346,10 +355,13 @@ def _remember(
 
 def _hear(memory: Memory, use: bool, heard: int) -> None:
     """Compare a report of INS_USE, received at heard, ns, with our orders."""
+    # The first report since the boot shows how it began.
+    is_first = memory.seen is None and not memory.tries
+    if use and is_first:
+        memory.without_notch = False
     ordered_at = max(memory.out_sent, memory.back_sent)
     # Without an order of this run, the last run's order counts.
     ordered = memory.back_sent > memory.out_sent
-    is_first = memory.seen is None and ordered_at == NEVER
     expected = (memory.seen,) if ordered_at == NEVER else (memory.seen, ordered)
     if use not in expected and not is_first:
         since = heard if memory.against_since is None else memory.against_since
@@ -371,9 +383,6 @@ def _hear(memory: Memory, use: bool, heard: int) -> None:
         # or, if this run sent none, somebody has put the IMU back.
         by_others = use and (changed or memory.out_sent == NEVER)
     is_over = use and (not memory.held or memory.out_sent != NEVER) and settled
-    if use and memory.seen is None and not memory.tries:
-        # The first report since the boot: the IMU was in use from the start.
-        memory.without_notch = False
     memory.seen = use
     if by_others or (memory.ours and is_over):
         memory.ours = memory.held = False
@@ -388,10 +397,10 @@ def _note_lanes(
 
     Lane k follows IMU k, or the first IMU in use while IMU k is out.
     """
-    first = next((k for k, imu in enumerate(view.imus) if imu.use), 0)
+    first = next((k for k, memory in enumerate(memories) if memory.seen), 0)
     seconds = min(max(elapsed, 0), NS) / NS
     for k, memory in enumerate(memories):
-        source = view.imus[k if view.imus[k].use else first]
+        source = view.imus[first if memory.seen is False else k]
         # While two others are bad a healthy one is apart from both.
         is_off = is_apart(source, settings) and (source.named or not source.ok)
         if view.armed and source.delivers and is_off:
@@ -400,18 +409,29 @@ def _note_lanes(
             memory.lane_angle *= max(0.0, 1.0 - seconds / LANE_RECOVERY)
 
 
-def _release(memories: Sequence[Memory], view: View, now: int) -> None:
+def _release(
+    memories: Sequence[Memory], view: View, now: int, settings: PolicySettings
+) -> None:
     """Rules 1 and 4: let go of IMUs that should be back in use."""
+    pairs = list(zip(memories, view.imus, strict=True))
+    # A link that brings no samples at all shows nothing about the IMUs.
+    is_heard = any(imu.delivers for imu in view.imus)
     none_left = all(
-        memory.ours or imu.stuck or imu.use is False
-        for memory, imu in zip(memories, view.imus, strict=True)
+        memory.ours
+        or imu.use is False
+        or imu.stuck
+        or (is_heard and _has_stood(memory.dead_since, REACTION, now))
+        for memory, imu in pairs
     )
-    for memory, imu in zip(memories, view.imus, strict=True):
+    only_bad = all(memory.ours or is_bad(imu, settings) for memory, imu in pairs)
+    for memory, imu in pairs:
         pause = min(PAUSE << max(0, memory.taken - 1), LONGEST_PAUSE)
         agrees = imu.agreed is not None and now - imu.agreed >= pause
-        may = view.monitored if view.armed else imu.named is False
-        heals = agrees and may and imu.delivers and not memory.without_notch
-        if memory.held and (view.restore or none_left or heals):
+        may = view.monitored if view.armed else imu.ok
+        heals = agrees and may and is_alive(imu)
+        is_better = only_bad and view.monitored and imu.ok and is_alive(imu)
+        wanted = (heals or is_better) and not memory.without_notch
+        if memory.held and (view.restore or none_left or wanted):
             memory.held = False
             memory.tries = 0
 
@@ -468,18 +488,25 @@ def _conditions(
         (k, _condition(memory, view.imus[k], view, now, longest[k] and is_odd_known))
         for k, memory in enumerate(memories)
     ]
+    is_heard = any(imu.delivers for imu in view.imus)
     alive = sum(not _has_stood(memory.dead_since, REACTION, now) for memory in memories)
     left = sum(memory.seen is not False for memory in memories)
     lanes = sum(memory.lane_angle < LOST_LANE for memory in memories)
     by_us = any(memory.ours and memory.seen is False for memory in memories)
     checks = (
-        (view.armed and alive <= 1, Condition.ALONE),
+        (view.armed and is_heard and alive <= 1, Condition.ALONE),
         (view.armed and by_us and left <= 1, Condition.LAST_IMU),
-        (lanes <= 1, Condition.LAST_LANE),
+        (view.armed and lanes <= 1, Condition.LAST_LANE),
         (view.armed and any(longest) and not is_any_ok, Condition.DISAGREE),
     )
     found.append((VEHICLE, _first(checks, Condition.REDUNDANT)))
     return found
+
+
+def _is_redundant(memories: Sequence[Memory], view: View) -> bool:
+    """Return whether two or more IMUs are in use and agree."""
+    pairs = zip(memories, view.imus, strict=True)
+    return sum(bool(m.seen and imu.agreed is not None) for m, imu in pairs) > 1
 
 
 def _has_stood(since: int | None, duration: int, now: int) -> bool:
@@ -496,11 +523,12 @@ def _condition(
     checks = (
         (is_danger, Condition.DANGER),
         (asked_back, Condition.STUCK_OUT),
-        (memory.without_notch, Condition.REBOOT),
+        (is_out and not view.armed and memory.without_notch, Condition.REBOOT),
         (is_out and not view.armed and imu.named is True, Condition.STAYS_OUT),
-        (is_out and not view.armed and imu.named is None, Condition.UNREPORTED),
+        (is_out and not view.armed and not imu.ok, Condition.NOT_OK),
         (is_out, Condition.OUT),
         (memory.left_alone, Condition.LEFT_ALONE),
+        (memory.seen is False, Condition.UNUSED),
         (apart, Condition.APART),
     )
     return _first(checks, Condition.FINE)

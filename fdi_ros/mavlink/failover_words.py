@@ -20,18 +20,19 @@ class Words(NamedTuple):
 
 
 WORDS = {
-    Condition.FINE: Words(INFO, "in use, no fault"),
+    Condition.FINE: Words(INFO, "in use, differs no more"),
     Condition.DANGER: Words(CRITICAL, "faulty AND IN USE: land"),
     Condition.OUT: Words(CRITICAL, "out of use"),
     Condition.STAYS_OUT: Words(CRITICAL, "still faulty, stays out of use"),
-    Condition.UNREPORTED: Words(WARNING, "out of use, monitor silent"),
+    Condition.NOT_OK: Words(WARNING, "stays out, monitor finds it not OK"),
     Condition.REBOOT: Words(CRITICAL, "no notch: set INS_USE{} 1 and reboot"),
     Condition.STUCK_OUT: Words(WARNING, "not back in use: no answer"),
-    Condition.LEFT_ALONE: Words(WARNING, "set by others, left alone"),
+    Condition.LEFT_ALONE: Words(WARNING, "left alone until disarmed"),
+    Condition.UNUSED: Words(WARNING, "not in use, not by failover"),
     Condition.APART: Words(WARNING, "differs from the others"),
     Condition.DISAGREE: Words(CRITICAL, "the IMUs disagree: land"),
     Condition.ALONE: Words(CRITICAL, "one IMU or none is alive: land"),
-    Condition.REDUNDANT: Words(INFO, "two IMUs and EKF lanes or more again"),
+    Condition.REDUNDANT: Words(INFO, "two IMUs or more agree again"),
     Condition.LAST_IMU: Words(CRITICAL, "one IMU left in use: land"),
     Condition.LAST_LANE: Words(CRITICAL, "one EKF lane left: land"),
 }

@@ -132,12 +132,15 @@ class Thinning:
         return True
 
 
-def read(number: int, payload: bytes) -> ImuSample | None:
-    """Return the sample in a payload of one of `MESSAGES`, or None without a new gyro sample."""
+def read(number: int, payload: bytes, zeros: bool = False) -> ImuSample | None:
+    """Return the sample in a payload of one of `MESSAGES`, or None without a new gyro sample.
+
+    zeros: a payload of zeros is a sample. Else it has no IMU, but a magnetometer.
+    """
     message = MESSAGES[number]
     data = payload.ljust(message.size, b"\0")
     time, *values = message.head.unpack_from(data)
-    if not any(values):
+    if not any(values) and not zeros:
         return None
     if message.updated_at >= 0:
         updated = int.from_bytes(
@@ -276,6 +279,7 @@ SLEW = (
 STEP = 20 * MS  #: A better offset further away is taken at once, ns.
 GRAIN = MS  #: Largest step of the times in answers, ns.
 LONGEST = NS  #: Longer round trips are ignored, ns.
+LATELY = 5 * NS  #: A link is as slow as its round trips of this time, ns.
 SURE = 3  #: Contradicting times or answers in a row that are believed.
 _KEPT = 64  # largest number of round trips, and of requests under way
 FIRST_FOR = 20  #: Number of requests at the short interval `FIRST_EVERY`.
@@ -356,6 +360,11 @@ class TimeSync:
     def synchronised(self) -> bool:
         """Return whether an answer has come."""
         return self._best is not None
+
+    def trip(self, now: int) -> int | None:
+        """Return the shortest round trip of late, ns, or None if none has come."""
+        halves = [half for at, _, half in self._trips if now - at < LATELY]
+        return 2 * min(halves) if halves else None
 
     def error(self, now: int) -> float | None:
         """Return a bound on the error of the offset, ns, or None if unknown."""

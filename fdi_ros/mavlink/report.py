@@ -87,7 +87,7 @@ class Reporter:
                 "no answer to TIMESYNC: stamps are late by the unknown latency of the link"
             )
         lost = recent.get("lost", 0)
-        heard = recent.get("messages", 0)
+        heard = recent.get("in use", 0)
         if lost > LOSSY * (lost + heard):
             words.append(f"{lost} of {lost + heard} messages lost")
         if more := [
@@ -234,8 +234,8 @@ class Announcer:
     channels
         Names of the channels. Reports on others are ignored.
     apart
-        Given beside failover, which sends texts of its own: present difference of the raw
-        rate of a unit, from 0, to the nearest other one, rad/s, NaN if unknown. Sets and
+        Given beside failover, which sends texts of its own: bound on the present difference
+        of the raw rate of a unit, from 0, and the nearest other one, rad/s, NaN if unknown. Sets and
         good news then stay in the diagnostics. A name waits while raw rates contradict it.
     """
 

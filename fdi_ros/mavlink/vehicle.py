@@ -342,6 +342,7 @@ class Vehicle:
 
     def _count_lost(self, sequence: int) -> bool:
         """Count the messages lost before this one; return whether it is newer than the last."""
+        self.counts["in use"] += 1
         gap = 0 if self._sequence is None else (sequence - self._sequence - 1) & 255
         is_new = gap < 128
         self.counts["lost"] += gap if is_new else 0
@@ -351,8 +352,9 @@ class Vehicle:
         return is_new
 
     def _sample(self, number: int, payload: bytes, now: int) -> ImuSample | None:
-        sample = read(number, payload)
         message = MESSAGES[number]
+        # A unit that has delivered may die: its zeros are values.
+        sample = read(number, payload, zeros=message.unit in self.units)
         if sample is None:
             if message.unit >= 0 and message.unit not in self.units:
                 self.magnetometers.add(message.unit)

@@ -116,12 +116,8 @@ class AutopilotNode(CheckedNode):
         self._failover = (
             None if params["failover"] == "off" else self._make_failover(params)
         )
-        apart = (
-            None
-            if self._failover is None
-            else self._failover.evidence.apart.__getitem__
-        )
-        self._announcer = Announcer(channels, apart) if params["statustext"] else None
+        bound = None if self._failover is None else self._failover.evidence.bound
+        self._announcer = Announcer(channels, bound) if params["statustext"] else None
         if (
             self._announcer is not None
             or self._sends_values

@@ -166,7 +166,7 @@ class Flight:
                     heard=self.told[k][1],
                     named=self.named[k],
                     blamed=self.named[k],
-                    ok=not self.named[k] and not self.error[k],
+                    ok=not self.named[k] and self.error[k] < self.settings.min_size,
                     delivers=self.delivers[k],
                     stuck=self.stuck[k],
                     size=size,

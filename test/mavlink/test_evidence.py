@@ -280,6 +280,85 @@ def test_a_named_gyro_within_the_tolerance_of_scales_is_not_blamed() -> None:
     assert watched.blamed(2.0) == {2}
 
 
+@pytest.mark.parametrize(("size", "hertz"), [(3.0, 5.0), (3.0, 20.0), (0.4, 12.0)])
+def test_an_imu_that_oscillates_and_is_named_does_not_agree(
+    size: float, hertz: float
+) -> None:
+    """A large oscillation is an error; a smaller one may be vibration: no order, no trust."""
+    watched = Watched()
+    watched.gyros[0] = lambda rate: (
+        rate + size * np.sin(2.0 * math.pi * hertz * watched.now / NS) * np.eye(3)[0]
+    )
+    watched.run(1.0)
+    watched.states[0] = FAULTY
+    found = [watched.step()[0] for _ in range(200)]
+    assert not any(imu.agreed for imu in found)
+    assert any(imu.blamed for imu in found) == (size > 1.0)
+    assert watched.evidence.bound(0) > 0.1, "the monitor's name is not contradicted"
+
+
+def test_a_dead_gyro_with_noise_does_not_agree_in_a_quiet_hover() -> None:
+    """Its rate differs from the others' only while they turn."""
+    watched = Watched()
+    watched.gyros[0] = lambda rate: 0.01 * rate
+    watched.states[:3] = [FAULTY] * 3
+    watched.run(1.0)
+    watched.out = [0]
+    watched.rate = lambda t: 0.01 * np.array([math.sin(2.1 * t), 1.0, 0.0])
+    assert not any(watched.step()[0].agreed for _ in range(500))
+    # One that has healed agrees once the vehicle turns, and at once if it is not doubted.
+    watched.gyros[0] = sound
+    assert watched.run(1.0).step()[0].agreed is None
+    watched.rate = lambda t: 0.2 * np.array([math.sin(2.1 * t), 1.0, 0.0])
+    assert watched.run(1.0).step()[0].agreed is not None
+
+
+def test_a_noisy_gyro_at_rest_does_not_make_the_others_stuck() -> None:
+    watched = Watched()
+    watched.gyros[1] = lambda rate: watched.random.normal(0.0, 0.03, 3)
+    watched.gyros[0] = watched.gyros[2] = zero
+    assert not any(imu.stuck for _ in range(300) for imu in watched.step())
+
+
+def test_scales_explain_a_difference_until_the_turn_is_out_of_the_average() -> None:
+    """A roll of 12 rad/s that stops within 60 ms, and a scale that is 3 % off."""
+    watched = Watched()
+    begun = watched.now
+    watched.rate = lambda t: np.array(
+        [
+            12.0 * float(np.clip((1.0 - (watched.now - begun) / NS) / 0.06, 0.0, 1.0)),
+            0,
+            0,
+        ]
+    )
+    watched.gyros[2] = lambda rate: 1.03 * rate
+    watched.states[6] = FAULTY
+    assert not watched.blamed(2.0)
+
+
+def test_samples_that_come_too_slowly_or_too_fast() -> None:
+    """Slow ones do not show vibration: unknown. Of fast ones only some are compared."""
+    slow = RawComparison(2, STEP)
+    fast = RawComparison(2, STEP)
+    for k in range(200):
+        for unit in (0, 1):
+            slow.feed(unit, START + 2 * k * STEP, (0.1 * unit, 0.0, 0.0))
+            fast.feed(unit, START + k * STEP // 4, (0.1 * unit, 0.0, 0.0))
+    assert slow.between(0, 1, START + 400 * STEP) is None
+    assert fast.between(0, 1, START + 50 * STEP, 8) is not None
+    assert fast.between(0, 1, START + 50 * STEP, 9) is None
+
+
+def test_a_set_that_flickers_names_its_imu() -> None:
+    watched = Watched()
+    watched.gyros[2] = biased(0.1)
+    found = set()
+    for k in range(20):
+        watched.states[6:] = [OK if k % 2 else AMBIGUOUS] * 3
+        found |= watched.blamed(0.1)
+    assert found == {2}
+
+
 # A name and its size ----------------------------------------------------------------------
 
 

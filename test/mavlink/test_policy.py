@@ -66,8 +66,9 @@ def test_a_late_answer_to_a_read_is_nobodys_hand_and_a_later_one_is():
 
 def on_the_ground(memory, now, *, named=False, use=False, boots=0):
     """Decision about the first of three IMUs, which has agreed for long, disarmed."""
-    first = Imu(use, now, named=named, delivers=True, size=0.0, agreed=START - 10**12)
-    other = Imu(True, now, named=named, delivers=True, size=0.0, agreed=START - 10**12)
+    imu = Imu(use, now, named=named, ok=named is False, delivers=True, size=0.0)
+    first = imu._replace(agreed=START - 10**12)
+    other = first._replace(use=True)
     view = View(
         (first, other, other),
         linked=True,
@@ -81,7 +82,7 @@ def on_the_ground(memory, now, *, named=False, use=False, boots=0):
 
 @pytest.mark.parametrize(
     ("named", "condition"),
-    [(False, None), (True, Condition.STAYS_OUT), (None, Condition.UNREPORTED)],
+    [(False, None), (True, Condition.STAYS_OUT), (None, Condition.NOT_OK)],
 )
 def test_on_the_ground_an_imu_goes_back_only_where_the_monitor_reports_no_fault(
     named, condition
