@@ -29,11 +29,11 @@ from fdi_ros.compiling.compiled import (
 )
 from fdi_ros.core.algebra import dot, invert
 from fdi_ros.detectors.naming import (
+    FEW_CHECKS,
     MISFIT,
     Inference,
     checks,
     explain,
-    moved_by,
     set_mean,
     unexplained,
 )
@@ -63,6 +63,7 @@ from fdi_ros.estimator.snapshots import (
     is_after_hole,
     move_biases,
     predict_from,
+    widen_scales,
 )
 from fdi_ros.model.samples import Array
 
@@ -77,7 +78,6 @@ SETTLED_TOGETHER = 2.0 * SETTLED_AMONG_FEW
 """Time that a name must stand before it is declared, s: one channel, one channel with at
 most `FEW_CHECKS` checks, two channels. Several faults look like one at first, and with
 few checks three faults explain any mean."""
-FEW_CHECKS = 3
 CLEAR = 5000.0
 """Log odds from which a single fault is named at once. A second error a twentieth as large
 would then show by five standard deviations, (0.05^2) 2 CLEAR = 25."""
@@ -87,8 +87,11 @@ many standard deviations, which noise does not reach in a flight, plus this shar
 named error, because the axes are not exactly known."""
 ALIKE = 1e-3  # least share of the variance of a channel that others do not explain
 WARMS = 30.0
-"""Time within which all biases may move by `Constants.largest_move` without a fault, s: the sensors
-warm, or rectify vibration."""
+"""Time within which all biases may move by `LARGEST_MOVES` without a fault, s: the sensors
+warm, rectify vibration, or feel a boost begin and end."""
+LARGEST_MOVES = 2.0
+"""Largest shifts of all biases within `WARMS`, over `Constants.largest_move`: a boost
+moves them twice."""
 UNSOLVED = 10.0
 """Time after which a case that no hypothesis explains ends, s. The error model is wrong there,
 and while all channels are suspects, the estimator learns nothing better."""
@@ -111,12 +114,8 @@ LONGEST_DRIFT = WARMS * (1 << DRIFT_TIMES)
 `DRIFT_TIMES` times, each half as long as the one before: 480, 240, 120 and 60."""
 # time after a gap before the mean starts anew, s: equal to the time that a name must stand
 LEAST_RETURN = 0.2
-# largest move of all biases at once, over the largest within `WARMS`: motors that start move
-# gyros by some 0.005 rad/s of 0.04
-LARGEST_STEP = 0.375
-FASTEST = (
-    2.5  # peak rate of a move over the mean rate: warming is fastest at the beginning
-)
+# peak rate of a move over its mean rate: warming is fastest at the beginning
+FASTEST = 2.5
 
 
 @record
@@ -140,6 +139,7 @@ class Case:
     moved_at: Real  # time of the last move, s since the start
     moved_since: Whole  # first sample that showed the last move
     reference: Channels  # biases before the last move, rad/s
+    farthest: Real  # from these without a fault, rad/s
     inference: Inference
 
 
@@ -199,7 +199,7 @@ def look_for_case(params: Constants, state: State) -> None:
             found = True
             case.onset = scale.first[(scale.newest - since + 1 + KEPT) % KEPT]
     if found:
-        open_case(params, state)
+        open_case(params, state, STANDS * math.log(params.limit))
 
 
 @compiled
@@ -226,7 +226,7 @@ def look_for_drift(params: Constants, state: State) -> None:
         seconds = LONGEST_DRIFT / (1 << k)
         if not case.open and kf.seconds > seconds:
             case.onset = kf.samples - int(seconds / params.period)
-            open_case(params, state)
+            open_case(params, state, STANDS * math.log(params.limit))
 
 
 @compiled
@@ -261,14 +261,14 @@ def look_for_change_in_hole(params: Constants, state: State) -> None:
             )
     if worst >= 2.0 * math.log(params.limit):
         case.onset = kf.hole_sample + 1
-        open_case(params, state)
+        open_case(params, state, STANDS * math.log(params.limit))
 
 
 @compiled
-def open_case(params: Constants, state: State) -> None:
+def open_case(params: Constants, state: State, least: float) -> None:
     """Return to the states before the onset, and keep the case only if a hypothesis stands.
 
-    A hypothesis stands where its log odds, with every uncertainty counted, pass `STANDS`.
+    A hypothesis stands where its log odds, with every uncertainty counted, pass ``least``.
     """
     kf = state.estimator
     case = state.case
@@ -285,7 +285,7 @@ def open_case(params: Constants, state: State) -> None:
         before = kf.hole_at
     predict_from(params, kf, before, kf.states)
     name_channels(params, state)
-    if case.open and case.inference.log_odds < STANDS * math.log(params.limit):
+    if case.open and case.inference.log_odds < least:
         copy_states(params.layout, case.before, kf.states)
         case.open = False
         kf.excluded_from_rate = 0
@@ -425,12 +425,8 @@ def name_channels(params: Constants, state: State) -> None:
         # A mean across a gap belongs to different motion.
         size = min(size, kf.samples - kf.returned + 1)
     case.louder = fill_louder(params, state, size)
-    explain_case(params, kf, case, size, 0.0)
-    std = 0.0 if case.isolated else moved_by(inference, params.sensors.n)
-    if std > 0.0 and let_biases_move(params, state, std):
+    if explain_beside_moves(params, state, size):
         return
-    if case.healthy_move > 0.0:
-        explain_case(params, kf, case, size, case.healthy_move)
     case.next = kf.samples + max(size // RENAME, 1)
     if gives_up(params, state, max(size // RENAME, 1) * params.period):
         return
@@ -441,6 +437,39 @@ def name_channels(params: Constants, state: State) -> None:
     case.suspects = inference.union
     isolate(params, kf, case)
     leave_aside(params, state)
+
+
+@compiled
+def explain_beside_moves(params: Constants, state: State, size: int) -> bool:
+    """Explain the mean of the last ``size`` samples; return whether all biases have shifted.
+
+    A shift that is too young to be accepted is no suspicion against any channel. No channel
+    is named while a shift is likely. A shift is compared with faults before moves of single
+    biases are allowed for, which would hide that other channels are quiet.
+    """
+    case = state.case
+    inference = state.case.inference
+    inference.may_shift = case.isolated == 0 and params.bias_move > 0.0
+    explain_case(params, state.estimator, case, size, 0.0)
+    age = (state.estimator.samples - case.onset) * params.period
+    shifted = inference.shift > 0.0 and inference.fitted
+    if (
+        shifted
+        and lately_moved(state) + inference.shift <= LARGEST_MOVES * params.largest_move
+    ):
+        if age > SETTLED_AMONG_FEW:
+            let_biases_move(params, state, inference.shift)
+        else:
+            case.next = state.estimator.samples + 1
+        return True
+    if case.healthy_move > 0.0:
+        may_be_shift = inference.may_be_shift
+        inference.may_shift = False
+        explain_case(params, state.estimator, case, size, case.healthy_move)
+        inference.may_be_shift = may_be_shift
+        if may_be_shift:
+            inference.common = 0
+    return False
 
 
 @compiled
@@ -500,7 +529,8 @@ def gives_up(params: Constants, state: State, seconds: float) -> bool:
     case = state.case
     layout = params.layout
     inference = state.case.inference
-    unsolved = case.isolated == 0 and not inference.fitted
+    unclear = inference.may_be_shift or not inference.fitted
+    unsolved = case.isolated == 0 and unclear
     case.unsolved = max(case.unsolved + (seconds if unsolved else -seconds), 0.0)
     if params.bias_move == 0.0 or case.unsolved < UNSOLVED:
         return False
@@ -592,28 +622,32 @@ def keep_suspects(case: Case) -> None:
 
 
 @compiled
-def let_biases_move(params: Constants, state: State, std: float) -> bool:
-    """Accept a move of all biases with this standard deviation, rad/s, unless it is too far.
+def lately_moved(state: State) -> float:
+    """Return the recent move of all biases, standard deviation, rad/s."""
+    case = state.case
+    passed = state.estimator.seconds - case.moved_at
+    return case.moved * math.exp(-passed / WARMS)
 
-    Returns whether the move was accepted.
-    """
+
+@compiled
+def let_biases_move(params: Constants, state: State, std: float) -> None:
+    """Accept a move of all biases with this standard deviation, rad/s."""
     kf = state.estimator
     case = state.case
     n = params.sensors.n
-    lately = case.moved * math.exp(-(kf.seconds - case.moved_at) / WARMS) + std
-    if lately > params.largest_move or std > LARGEST_STEP * params.largest_move:
-        return False
-    case.moved = lately
+    case.moved = lately_moved(state) + std
     case.moved_at = kf.seconds
     case.moved_since = case.onset
+    case.farthest = case.moved + params.largest_move
     for i in range(n):
         case.reference[i] = kf.states.x[i]
     move_biases(params, kf, std, 0.5 * params.largest_move / WARMS)
+    # A bias that moves as a turn begins has been learned as a scale error.
+    widen_scales(params, kf.states)
     kf.noise.lived[kf.noise.regime] = 0.0
     update_unknown(kf.noise, n, 0.0)
     forget_evidence(params, state)
     update_weights(params, kf)
-    return True
 
 
 @compiled
@@ -627,7 +661,7 @@ def goes_too_far(params: Constants, state: State) -> bool:
     for r in range(params.layout.count):
         far = (
             r < params.sensors.n
-            and abs(kf.states.x[r] - case.reference[r]) > params.largest_move
+            and abs(kf.states.x[r] - case.reference[r]) > case.farthest
         )
         if far or (
             0 <= feeds[r] < params.sensors.n
@@ -642,9 +676,10 @@ def undo_move(params: Constants, state: State) -> None:
     """Open a case at the onset of a supposed move of all biases, and accept no move for `WARMS`."""
     case = state.case
     case.onset = case.moved_since
-    case.moved = math.e * params.largest_move
+    case.moved = math.e * LARGEST_MOVES * params.largest_move
     case.moved_at = state.estimator.seconds
-    open_case(params, state)
+    # The way that the bias has gone is evidence by itself.
+    open_case(params, state, ENDS)
 
 
 @compiled

@@ -30,7 +30,7 @@ from fdi_ros.compiling.compiled import (
     compiled,
     record,
 )
-from fdi_ros.core.algebra import along, dot, dot_in, invert
+from fdi_ros.core.algebra import along, dot, dot_in, factorise, invert
 from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity
 from fdi_ros.core.records import Matrix, Parity
 from fdi_ros.estimator.displacement import add_displacement_of_mean
@@ -48,8 +48,12 @@ from fdi_ros.estimator.noise import BLOCK, BURST, MOTION, Noise
 from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import Array
 
-MOST = MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS
-"""Largest number of hypotheses: channels, pairs, and three for each unit."""
+SHIFTS, SMALLEST_SHIFT = 5, 1.0 / 16.0
+"""Number of sizes of a shift of all biases, and the smallest one, standard deviation over
+`Constants.largest_move`. Each further size is twice as large, up to 40 mrad/s of gyros: a
+boost of 10 g moves a gyro of 2 mrad/s a g by 20, and at its end by as much again."""
+MOST = MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS + SHIFTS
+"""Largest number of hypotheses: channels, pairs, three for each unit, shifts of all biases."""
 COINCIDENCE = 0.1
 """Prior odds, against one channel, of all pairs with that channel and of each way in which
 any unit is wrong. The value is deliberately large. With three parallel gyros, the same
@@ -58,9 +62,9 @@ coincidence protect the healthy third."""
 TWO_CHECKS = COINCIDENCE / 2
 """Factor on the odds of pairs where only two checks exist. A pair of five channels explains
 any mean, so with full odds no fault would ever be named."""
-GAIN_STD, DELAY_STD = 0.1, 0.01
+GAIN_STD, DELAY_STD = 0.1, 0.03
 """Standard deviations for a unit that is wrong as a whole: of its gain (a wrong range), and
-of its delay in s (a clock that was set)."""
+of its delay in s (a clock that was set, by 40 ms for instance)."""
 LEAST_PRESENCE = (
     0.9  # share of the samples that a channel must deliver before its mean counts
 )
@@ -71,12 +75,15 @@ MISFIT = 0.004
 FIT, FIT_PER_CHECK = 6.0, 2.5
 """Largest chi-square of the unexplained rest: a constant, and a part for each degree of
 freedom. Noise alone exceeds the limit at most once in 240 cases."""
+SHIFTED, SHIFTED_AMONG_FEW = 0.1, 0.01
+"""Prior odds, against one channel, of a shift of all biases, and with at most `FEW_CHECKS`
+checks. With 0.03, a healthy gyro is named in 6 of 320 simulated flights with boosts, motors
+and heat, with 0.1 in 4. With 0.1 among few, 0.02 rad/s on a cone of six is never named."""
+FEW_CHECKS = 3
+"""With so few checks, three faults or a shift explain any mean."""
 SET_MARGIN = 5.0
 """Accepted risk that a set misses one of several faulty channels, as a multiple of the
 risk of a wrong name. The risk that it misses all of them is far smaller."""
-UNEXPLAINED_SHARE = 0.2
-"""All biases have moved where the best hypothesis of a fault leaves at least this share of
-the chi-square. A fault of one or two channels leaves almost nothing, whatever its size."""
 NO_LOG = -1e300
 
 Odds = Annotated[NDArray[np.float64], "f8", (MOST,)]
@@ -105,6 +112,7 @@ class Inference:
     at: Projection  # projection of the error states in the motion of the mean
     parity: Parity
     u: Channels  # A y, s/rad
+    whitened: Channels  # u in units of its standard deviation with a shift
     total: Real  # y' A y / 2
     direction: Directions
     matrix: Matrix
@@ -117,7 +125,9 @@ class Inference:
     fits: Odds  # ``fit`` of each hypothesis
     errors: Errors  # error of each channel by each hypothesis, rad/s
     members: Sets  # channels of each hypothesis
-    whole: Wholes  # 1: the hypothesis calls the gyros healthy and their unit wrong
+    whole: Wholes  # 1: the hypothesis calls the gyros healthy
+    may_shift: Flag  # 1: all biases may have shifted
+    shifts: Odds  # standard deviation of the shift in each hypothesis, rad/s; 0: none
     # The answer:
     log_odds: Real  # log odds of the likeliest hypothesis against no fault
     # faulty channels: all likely hypotheses have them in common, and the likeliest fits
@@ -125,6 +135,8 @@ class Inference:
     union: Mask  # a set with at least one faulty channel
     likeliest: Mask  # channels of the likeliest hypothesis
     fit_of_best: Real  # part of ``total`` that the likeliest hypothesis explains
+    shift: Real  # of the likeliest hypothesis, rad/s; 0: no shift
+    may_be_shift: Flag  # 1: a shift is among the likely hypotheses
     fitted: Flag  # 1: the likeliest hypothesis leaves only noise
     error: Channels  # error of each channel if no other is faulty, rad/s
     largest: Real  # largest error within the likeliest hypothesis, rad/s
@@ -318,6 +330,7 @@ def add(
     inference.odds[inference.count] = log_odds
     inference.fits[inference.count] = inference.fit
     inference.members[inference.count] = members
+    inference.shifts[inference.count] = 0.0
     inference.whole[inference.count] = whole
     inference.count += 1
 
@@ -406,6 +419,46 @@ def add_units(params: Constants, inference: Inference) -> None:
 
 
 @compiled
+def add_shifts(inference: Inference, n: int, largest: float) -> None:
+    """Add shifts of all biases, as where motors start or a boost begins: no channel is faulty.
+
+    ``largest`` is the size of the largest one, rad/s.
+    """
+    few = checks(inference.mask, n) <= FEW_CHECKS
+    prior = math.log((SHIFTED_AMONG_FEW if few else SHIFTED) / SHIFTS)
+    std = SMALLEST_SHIFT * largest
+    set_direction(inference, n, 0, -1)
+    for _ in range(SHIFTS):
+        odds = prior + log_ratio_of_shift(inference, n, std)
+        add(inference, n, 1, odds, 0, True)
+        inference.shifts[inference.count - 1] = std
+        std *= 2.0
+
+
+@compiled
+def log_ratio_of_shift(inference: Inference, n: int, std: float) -> float:
+    """Return the log likelihood ratio of independent errors of all channels, rad/s.
+
+    With T = std^2 I the ratio is ``u' (A + T^-1)^-1 u / 2 - log det(I + T A) / 2``.
+    ``inference.fit`` is its first part.
+    """
+    information = inference.parity.information
+    factor = inference.parity.weight
+    whitened = inference.whitened
+    for i in range(n):
+        for j in range(i):
+            factor[i, j] = information[i, j]
+        factor[i, i] = information[i, i] + 1.0 / (std * std)
+    log_det = factorise(factor, n, factor) + 2.0 * n * math.log(std)
+    inference.fit = 0.0
+    for i in range(n):
+        rest = inference.u[i] - dot(factor[i], whitened, i)
+        whitened[i] = rest / factor[i, i]
+        inference.fit += 0.5 * whitened[i] * whitened[i]
+    return inference.fit - 0.5 * log_det
+
+
+@compiled
 def update_spread(inference: Inference, n: int, total: float) -> None:
     """Update the mean products of the errors over all hypotheses.
 
@@ -440,6 +493,7 @@ def update_best(inference: Inference, n: int) -> None:
     best = largest_of(inference)
     inference.log_odds = inference.odds[best]
     inference.likeliest = inference.members[best]
+    inference.shift = inference.shifts[best]
     inference.fit_of_best = inference.fits[best]
     free = checks(inference.mask & ~inference.likeliest, n)
     inference.fitted = 2.0 * (
@@ -455,8 +509,9 @@ def update_best(inference: Inference, n: int) -> None:
 def choose(inference: Inference, n: int, confidence: float) -> None:
     """Take the likeliest hypotheses until their odds add up to the confidence.
 
-    A channel that all of these hypotheses contain is faulty. If one hypothesis is a unit
-    that measures motion wrongly, all gyros may be healthy and no channel is named.
+    A channel that all of these hypotheses contain is faulty. If one hypothesis is a shift,
+    or a unit that measures motion wrongly, all gyros may be healthy and no channel is
+    named.
     """
     update_best(inference, n)
     top = inference.log_odds
@@ -470,6 +525,7 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
     common = -1
     enough = 1.0 - SET_MARGIN * (1.0 - confidence)
     some_whole = False
+    inference.may_be_shift = False
     for _ in range(inference.count):
         if mass >= confidence * total:
             break
@@ -481,12 +537,15 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
         inference.odds[best] = 0.0
         common &= inference.members[best]
         some_whole = some_whole or inference.whole[best] != 0
+        if inference.shifts[best] > 0.0:
+            inference.may_be_shift = True
     # A unit with errors in all its channels is a set, not names: the error of some
     # channels may be very small.
     few = common & (common - 1) & ((common & (common - 1)) - 1) == 0
     named = inference.fitted and common > 0 and few and not some_whole
     inference.common = common if named else 0
-    inference.union = union if inference.fitted else inference.judged
+    explained = inference.fitted and inference.shift == 0.0
+    inference.union = union if explained else inference.judged
 
 
 @compiled
@@ -509,20 +568,9 @@ def explain(params: Constants, inference: Inference) -> None:
     inference.count = 0
     add_channels(inference, n)
     add_units(params, inference)
+    if inference.may_shift:
+        add_shifts(inference, n, params.largest_move)
     choose(inference, n, params.confidence)
-
-
-@compiled
-def moved_by(inference: Inference, n: int) -> float:
-    """Return the standard deviation by which all biases have moved, rad/s; 0: they have not.
-
-    Biases have moved where no hypothesis of a few channels leaves only noise, and even
-    the best one leaves much of the mean unexplained.
-    """
-    residual = 2.0 * (inference.total - inference.fit_of_best)
-    if inference.fitted or residual < UNEXPLAINED_SHARE * 2.0 * inference.total:
-        return 0.0
-    return unexplained(inference, n)
 
 
 @compiled

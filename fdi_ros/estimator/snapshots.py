@@ -12,7 +12,14 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.estimator.error_states import ErrorStates, copy_states, predict
+from fdi_ros.estimator.error_states import (
+    ONE,
+    SIGNALS,
+    TURN,
+    ErrorStates,
+    copy_states,
+    predict,
+)
 from fdi_ros.estimator.estimator import (
     LONG_TIME,
     SNAPSHOTS,
@@ -84,6 +91,17 @@ def add_to_biases(
             states.p[r, r] += std * std
         elif 0 <= params.layout.feeds[r] < params.sensors.n:
             states.p[r, r] += rate_std * rate_std
+
+
+@compiled
+def widen_scales(params: Constants, states: ErrorStates) -> None:
+    """Add their priors to the variances of the states that multiply the rate."""
+    layout = params.layout
+    for i in range(params.sensors.n):
+        for k in range(SIGNALS):
+            place = layout.place[i, k]
+            if place >= 0 and layout.by[k] != ONE and layout.by[k] != TURN:
+                states.p[place, place] += layout.prior[place] * layout.prior[place]
 
 
 @compiled

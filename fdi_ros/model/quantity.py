@@ -32,7 +32,7 @@ class Quantity(NamedTuple):
     """Standard deviation of the move of a healthy bias in flight, in ``turn_on_std``.
 
     With 0.04 a thermal shock of 6 mrad/s names a healthy gyro in 1 of 16 flights, with 0.06
-    in none, and the IMU that warms in a crash is named at 17 s and 22 s. Accelerometers: 0,
+    in none, and the IMU that warms in a crash is declared at 17 s and 21 s. Accelerometers: 0,
     as a fault of 0.3 m/s^2 would not be named."""
     largest_move: float
     """By which all healthy biases may move together within half a minute, over the natural size."""

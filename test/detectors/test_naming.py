@@ -21,14 +21,21 @@ from fdi_ros.detectors.naming import (
     FIT,
     FIT_PER_CHECK,
     GAIN_STD,
+    SHIFTED,
+    SHIFTED_AMONG_FEW,
+    SHIFTS,
+    SMALLEST_SHIFT,
     SPREAD,
     TWO_CHECKS,
     Inference,
     add_channels,
+    add_shifts,
     add_units,
     explain,
 )
 from fdi_ros.detectors.sequential import Sequential
+
+LARGEST = 0.04  # shift of all biases, rad/s
 
 
 class Mean:
@@ -57,6 +64,7 @@ class Mean:
         self.own["count"] = 0
         add_channels(self.own, self.n)
         add_units(self.params, self.own)
+        add_shifts(self.own, self.n, LARGEST)
         count = int(self.own["count"])
         return zip(
             *(self.own[name][:count].tolist() for name in ("members", "whole", "odds")),
@@ -138,6 +146,10 @@ def oracle(mean):
                 np.where(inside, about, 0.0)[:, None],
                 std,
             )
+    prior = SHIFTED if n > 6 else SHIFTED_AMONG_FEW
+    for std in LARGEST * SMALLEST_SHIFT * 2.0 ** np.arange(SHIFTS):
+        ratio = evidence(mean, std**2 * np.eye(n)) - healthy
+        found.append((0, 1, np.log(prior / SHIFTS) + ratio))
     return found
 
 

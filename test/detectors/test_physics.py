@@ -110,6 +110,23 @@ def test_a_quiet_gyro_is_not_stuck_because_another_one_fails(detector, kind):
         assert 12.0 < first_named(judge(quiet, t, z), t, 5) < limit
 
 
+def test_biases_that_all_shift_as_a_boost_begins_are_no_fault(pipeline):
+    """By 20 mrad/s from 14 to 19 s, as the body begins to spin; 0.3 rad/s afterwards is named within 2 s."""
+    for seed in range(3):
+        t, rate, noise = flight(seed, 60.0)
+        rng = np.random.default_rng(seed)
+        spin = 2.0 * np.clip(t - 14.0, 0.0, 1.0)[:, None] * [0.0, 0.0, 1.0]
+        pushed = np.clip((t - 14.0) / 0.2, 0, 1) * np.clip((19.0 - t) / 0.5, 0, 1)
+        shift = 0.02 * rng.standard_normal(9) * pushed[:, None]
+        z = np.tile(rate + spin, 3) * (1 + 0.003 * rng.standard_normal(9))
+        z += noise + shift
+        z[t > 45.0, 4] += 0.3
+        output = judge(pipeline, t, z)
+        assert 45.0 < first_named(output, t, 4) < 47.0
+        assert not (np.delete(output.state, 4, axis=1) == ChannelState.FAULTY).any()
+        assert not declared(output)[(t > 30.0) & (t < 45.0)].any()
+
+
 def test_biases_that_move_one_unit_after_another_are_no_fault(pipeline):
     """By 6 mrad/s within 10 s, as in a thermal shock; 0.1 rad/s is named within 2 s all the same."""
     for seed in range(3):
