@@ -40,6 +40,7 @@ from fdi_ros.config.settings import (
     fields_of,
     setting,
 )
+from fdi_ros.config.unit_names import unit_names
 from fdi_ros.errors import ConfigError
 from fdi_ros.system import find_shipped
 from fdi_ros.system.files import NAME
@@ -191,10 +192,8 @@ class Config:
 
     @property
     def imu_names(self) -> tuple[str, ...]:
-        """Names of the triads."""
-        return self.imus.names or tuple(
-            f"imu_{k + 1}" for k in range(len(self.imus.topics))
-        )
+        """Names of the triads: as given, or by their topics."""
+        return self.imus.names or tuple(unit_names(self.imus.topics))
 
     @property
     def topics(self) -> tuple[str, ...]:

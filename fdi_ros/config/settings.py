@@ -197,7 +197,7 @@ class ChannelsConfig:
         "topic of 4 to 12 accelerometers, one std_msgs/Float64MultiArray a sample, m/s^2; empty: there are none",
     )
     names: tuple[str, ...] = setting(
-        (), "name of each channel; empty: g1, g2, ... or imu_1.x, ..."
+        (), "name of each channel; empty: g1, g2, ... or by the triads: imu_1.x, ..."
     )
     units: tuple[str, ...] = _per_channel(
         (),
@@ -213,7 +213,7 @@ class ImusConfig:
 
     topics: tuple[str, ...] = setting((), "topic of each triad, 2 to 4")
     names: tuple[str, ...] = _per_triad(
-        (), "name of each triad; empty: imu_1, imu_2, ..."
+        (), "name of each triad; empty: by the topics, /imu_1/data_raw is imu_1"
     )
     mounts: tuple[float, ...] = _per_triad(
         (),

@@ -22,6 +22,7 @@ from fdi_ros.config.config import (
     Config,
     parameter_file,
 )
+from fdi_ros.config.unit_names import unit_names
 from fdi_ros.core.alignment import MAX_BRIDGE
 from fdi_ros.core.sources import input_of
 from fdi_ros.errors import BagError, ConfigError
@@ -32,7 +33,6 @@ from fdi_ros.inspection.fitness import (
     needs,
     one_clock,
 )
-from fdi_ros.inspection.names import unit_names
 from fdi_ros.inspection.topics import (
     GAP,
     TopicReport,

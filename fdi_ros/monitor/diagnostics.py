@@ -291,8 +291,11 @@ def _whole_message(
         if channel.state == ChannelState.OK and channel.name not in doubtful
     }
     about = [channel.name for channel in status.channels if channel.name in worse]
+    alive = sum(not channel.is_left_out for channel in status.channels)
+    # That all faults are detected, and none isolated, needs no list of all channels.
+    alike = len(status.can_detect) == alive and not status.can_isolate
     words = [
-        status.note,
+        "" if alike else status.note,
         *_format_units(status, worse),
         f"degraded: {', '.join(about)}" if about else "",
         first_of(list(map(str, concerns)), MOST_CONCERNS, "; ") if concerns else "",

@@ -195,3 +195,19 @@ def test_an_error_says_where_it_is_in_one_line(tmp_path, text, words):
     assert words in said
     assert "unicode string" not in said
     assert "\n" not in said
+
+
+@pytest.mark.parametrize(
+    ("topics", "names"),
+    [
+        (["/front/imu", "/rear/imu"], ("front", "rear")),
+        (["imu_0/data", "imu_1/data"], ("imu_0", "imu_1")),
+    ],
+)
+def test_units_without_names_are_named_after_their_topics(topics, names, tmp_path):
+    path = tmp_path / "two.yaml"
+    given = {"input": "imus", "imus": {"topics": topics}}
+    path.write_text(yaml.safe_dump({"/**": {"ros__parameters": given}}))
+    config = Config.from_file(path)
+    assert config.imu_names == names
+    assert config.channel_names[0] == f"{names[0]}.x"
