@@ -159,6 +159,10 @@ def _faulty_sentences(faulty: Sequence[Episode], unit: Unit) -> str:
     return " ".join(sentences)
 
 
+_WITHOUT_SIZE = (Reason.NON_FINITE.value, Reason.STUCK.value, Reason.FROZEN.value)
+"""Reasons that say all: the size of the error changes with the motion."""
+
+
 def _who(one: Episode) -> str:
     """Return the channels as spoken: ``imu_0, x and y,``."""
     if one.halves:
@@ -203,7 +207,7 @@ def _size_sentences(one: Episode, unit: Unit) -> list[str]:
     unit = unit_for(one, unit)
     if one.apart is not None:
         return [f"They are {_size(one.apart.size, unit)} {unit.name} apart."]
-    if one.state != "FAULTY":
+    if one.state != "FAULTY" or one.evidence.reason.startswith(_WITHOUT_SIZE):
         return []
     sizes = {
         each.channel.rpartition(".")[2] if len(one.channels) > 1 else "": each.size
@@ -240,7 +244,8 @@ def _size_words(size: Size, unit: Unit) -> str:
     if size.course == "proportional":
         share = 100.0 * abs(size.share_of_rate or 0.0)
         low = (size.share_of_rate or 0.0) < 0
-        return f"reads {share:.2g} % too {'little' if low else 'much'}"
+        words = f"{share:.0f}" if share >= 10.0 else f"{share:.2g}"
+        return f"reads {words} % too {'little' if low else 'much'}"
     if size.course == "noisy":
         return f"has noise of {value} {unit.name}"
     if size.course == "varying":

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fdi_ros.config.unit_names import unit_names
+from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.soundness import (
@@ -33,6 +34,7 @@ from fdi_ros.replay.words import sentences
 CASES = ROOT.parent / "shared" / "data" / "cases"
 LOGS = ROOT.parent / "shared" / "data" / "logs"
 SITL = ROOT.parent / "shared" / "data" / "sitl"
+UNITS = [f"imu_{k}.{axis}" for k in range(3) for axis in "xyz"]
 TRIADS = Geometry.from_triads([np.eye(3)] * 3)
 
 needs_cases = pytest.mark.skipif(
@@ -135,6 +137,35 @@ def test_the_faulty_unit_is_named_after_its_topic(topics, faulty, fdi, tmp_path)
     assert first.startswith(f"FAULTY: {faulty}.y from 12.")
     assert f"{faulty} is {topics[1]}" in second
     assert said.code == 3
+
+
+@pytest.mark.parametrize(
+    ("fault", "sentence"),
+    [
+        (
+            "kind=stuck start=12",
+            "Reason: stuck: repeats one value while the others move.",
+        ),
+        ("kind=dropout start=12 stop=13", "Reason: not a finite number."),
+        ("kind=scale size=-1 start=12", "It reads 100 % too little."),
+    ],
+)
+def test_a_fault_is_one_plain_sentence(fault, sentence, fdi, tmp_path):
+    """Neither the size of an error that says nothing, nor a power of ten."""
+    time = np.arange(0, 24, 0.02)
+    random = np.random.default_rng(8)
+    turn = 0.8 * np.clip(time - 6, 0, 1)[:, None] * np.sin(np.outer(time, (0.7, 1, 2)))
+    injector = Injector([parse_fault(f"channel=imu_1.y {fault}")], UNITS)
+    rates = np.hstack([turn + random.normal(0, 0.003, turn.shape) for _ in range(3)])
+    struck = injector.apply(Block((time * 1e9).astype(np.int64), rates))
+    table = np.column_stack([time, struck.z])
+    head = ",".join(["time", *(name.replace(".", "_") for name in UNITS)])
+    path = tmp_path / "three.csv"
+    np.savetxt(path, table, "%.7f", delimiter=",", header=head, comments="")
+    first = fdi("replay", path).out.splitlines()[0]
+    assert re.match(r"FAULTY: imu_1\.y .*from 1[2-9]\.\d s", first), first
+    size = first.partition(" s. ")[2]
+    assert size.partition(" First seen")[0] == sentence
 
 
 # Deliveries and values
