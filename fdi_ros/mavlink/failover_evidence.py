@@ -26,10 +26,12 @@ from fdi_ros.mavlink.failover_policy import Imu
 from fdi_ros.mavlink.protocol import MS, NS, Vector
 
 AVERAGED = 120 * MS  #: Differences are averaged over the samples of this time, ns.
+SPANNED = AVERAGED // 2  #: A mean of samples within less time is not known, ns.
 CURRENT = 500 * MS  #: Oldest pair of samples that still counts, ns.
 #: Time constant with which the recent largest size decays, s. Once the IMU has agreed
 #: for `HEALED`, only the present size counts.
 DECAY = 0.5
+BREAK = 100 * MS  #: A shorter break does not end an agreement, ns.
 HEALED = NS // 2  #: Time of agreement after which an earlier size is forgotten, ns.
 LASTING = 300 * MS  #: A set must stand for this time to name an IMU, ns,
 GAP = 200 * MS  #: without a break longer than this, ns.
@@ -222,15 +224,18 @@ class RawComparison:
     ) -> Difference | None:
         """Return the difference of two IMUs at time now, ns, or None if not known.
 
-        Not known: no recent pairs, or only such that are too far apart in time to show
-        an oscillation.
+        Not known: no recent pairs, or too few or too far apart in time to show an
+        oscillation.
 
-        last: number of samples averaged. 0: all within `AVERAGED`.
+        last: number of samples averaged. 0: all within `AVERAGED`, over `SPANNED` at
+        least.
         """
         rows = self._rows(unit, other, now)[-last:]
         stamps = [stamp for stamp, _ in rows]
         gaps = [after - before for before, after in pairwise(stamps)]
         if not gaps or len(rows) < last or min(gaps) > self._longest:
+            return None
+        if not last and (len(rows) <= FEWEST or sum(gaps) < SPANNED):
             return None
         values = np.array([difference for _, difference in rows])
         mean = values.mean(axis=0)
@@ -296,6 +301,7 @@ class Evidence:
         # Since when each IMU agrees with another, ns, and agrees with one that has turned.
         self._agreed: list[int | None] = [None] * count
         self._turned: list[int | None] = [None] * count
+        self._agreed_at = [0] * count  # when each IMU last agreed, ns
         self._odd = -1  # the IMU that is bad without a name, or -1
         self._odd_since = 0
         self._odd_seen = 0
@@ -427,9 +433,12 @@ class Evidence:
         """Return since when an IMU agrees with another, ns, or None."""
         doubted = bool(self._doubts(unit))
         agreeing = [k for k in partners if self._agree(unit, k, doubted)]
-        if not agreeing or (is_out and self._is_contradicted(unit, partners)):
+        is_contradicted = is_out and self._is_contradicted(unit, partners)
+        if agreeing:
+            self._agreed_at[unit] = now
+        if is_contradicted or now - self._agreed_at[unit] > BREAK:
             self._agreed[unit] = self._turned[unit] = None
-        else:
+        elif agreeing:
             self._agreed[unit] = self._agreed[unit] or now
             if max(map(self.raw.rate, agreeing)) >= TURNING:
                 self._turned[unit] = self._turned[unit] or now

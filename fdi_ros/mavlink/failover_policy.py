@@ -379,10 +379,10 @@ def _hear(memory: Memory, use: bool, heard: int) -> None:
         # Out again, long after our last order to take it out.
         by_others = not use and changed and settled
     else:
-        # Out before and now in use: not by us. Never reported out: our order was lost,
-        # or, if this run sent none, somebody has put the IMU back.
-        by_others = use and (changed or memory.out_sent == NEVER)
-    is_over = use and (not memory.held or memory.out_sent != NEVER) and settled
+        # Out before and now in use: not by us. Never reported out to this run: the
+        # order was lost.
+        by_others = use and changed and memory.out_sent != NEVER
+    is_over = use and settled
     memory.seen = use
     if by_others or (memory.ours and is_over):
         memory.ours = memory.held = False

@@ -291,6 +291,7 @@ def test_an_imu_that_oscillates_and_is_named_does_not_agree(
     )
     watched.run(1.0)
     watched.states[0] = FAULTY
+    watched.run(0.2)
     found = [watched.step()[0] for _ in range(200)]
     assert not any(imu.agreed for imu in found)
     assert any(imu.blamed for imu in found) == (size > 1.0)

@@ -209,6 +209,40 @@ def test_with_a_limit_a_worse_imu_is_announced_and_stays(tmp_path: Path) -> None
     assert "IMU 3 faulty AND IN USE: land" in flying.texts
 
 
+@pytest.mark.parametrize("frequency", [49.8, 99.7])
+def test_a_pause_of_the_link_makes_no_error_of_vibration(
+    tmp_path: Path, frequency: float
+) -> None:
+    """After it the first samples alone do not show an oscillation."""
+    autopilot = Autopilot("ardupilot", motion=shaken((3,), frequency, 0.3))
+    talk = Monitored(tmp_path, autopilot).run(10.0)
+    autopilot.armed = True
+    talk.run(12.0)
+    talk.states[6:] = [FAULTY, OK, OK]
+    for _ in range(6):
+        talk.cut = True
+        talk.run(0.14)
+        talk.cut = False
+        talk.run(1.0)
+    assert not autopilot.sets
+
+
+def test_an_order_lost_as_the_companion_dies_is_given_again(
+    flying: Monitored, tmp_path: Path
+) -> None:
+    autopilot = flying.autopilots[0]
+    autopilot.read_only.update(PARAMETERS)
+    flying.fault(2, 1.0, seconds=0.5)
+    flying.failover.close()
+    autopilot.read_only.clear()
+    boot, start = autopilot.boot, autopilot.start
+    again = Monitored(tmp_path, autopilot)
+    again.now, autopilot.boot, autopilot.start = flying.now, boot, start
+    again.fault(2, 1.0, seconds=15.0)
+    assert again.in_use == [True, False, True]
+    assert not any("left alone" in text for text in again.texts)
+
+
 @pytest.mark.parametrize("size", [0.0, 0.02])
 def test_a_name_without_a_raw_difference_does_nothing(
     flying: Monitored, size: float
