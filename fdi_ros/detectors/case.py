@@ -95,12 +95,15 @@ moves them twice."""
 UNSOLVED = 10.0
 """Time after which a case that no hypothesis explains ends, s. The error model is wrong there,
 and while all channels are suspects, the estimator learns nothing better."""
-LOUDER = 4.0
-"""Noise variance since the onset over the learned one, from which the noise has grown: the samples of
-a fault are as noisy as before."""
-STEPS, JUMPS = 16, 2
-"""Smallest number of differences that show how noisy the last samples are, and number of the
-largest ones among them that are left out: the onset of a fault is no noise."""
+LOUDER = 3.0
+"""Excess of the noise variance since the onset, over the learned variance, from which the noise has
+grown: the samples of a fault are as noisy as before."""
+STEPS = 16
+"""Smallest number of differences that show how noisy the last samples are. The two largest ones are
+left out, because the onset of a fault is no noise."""
+STEADY = 9.0
+"""Square of the mean since the onset over the noise of single samples, from which the values are
+those of a fault: a filter spreads the onset of a fault over some samples, which is no noise."""
 MOVE_TIME = 1.0
 """Age of a fault, s, from which it must exceed what healthy biases move in flight. In simulated
 thermal shocks of 6 mrad/s a healthy gyro is named in 17 of 48 flights without this, in 9
@@ -474,7 +477,7 @@ def explain_beside_moves(params: Constants, state: State, size: int) -> bool:
 
 @compiled
 def fill_louder(params: Constants, state: State, size: int) -> bool:
-    """Find how much noisier the last ``size`` samples are than the learned noise; return whether any channel is.
+    """Find how much noisier than learned the last ``size`` samples are; return whether any channel is.
 
     A channel that becomes noisy shows means that its learned noise does not explain.
     """
@@ -485,13 +488,27 @@ def fill_louder(params: Constants, state: State, size: int) -> bool:
     for i in range(params.sensors.n):
         inference.louder[i] = 0.0
         if kf.judged >> i & 1:
-            grown = mean_step(scale, i, min(max(size - 1, STEPS), KEPT - 1), JUMPS)
-            if 1 < size <= JUMPS + 1:
-                grown = max(grown, mean_step(scale, i, size - 1, 0))
-            grown *= normal_variance(kf, i)
-            inference.louder[i] = max(grown - LOUDER, 0.0) * kf.noise.now.sample[i]
+            grown = mean_step(scale, i, min(max(size - 1, STEPS), KEPT - 1), 2)
+            if 1 < size <= STEPS:
+                grown = max(grown, mean_step(scale, i, size - 1, size > 3))
+            if square_of_mean(scale, i, min(size, KEPT)) > STEADY * grown:
+                continue
+            # The statistic shows a share of the noise of its channel.
+            own = kf.parity.information[i, i] * kf.noise.now.sample[i]
+            share = min(max(own, LEAST_SHARE), 1.0)
+            excess = (grown * normal_variance(kf, i) - 1.0) / share
+            inference.louder[i] = max(excess - LOUDER, 0.0) * kf.noise.now.sample[i]
             is_louder = is_louder or inference.louder[i] > 0.0
     return is_louder
+
+
+@compiled
+def square_of_mean(scale: Scale, i: int, count: int) -> float:
+    """Return the square of the mean of the last values of channel i."""
+    total = 0.0
+    for k in range(count):
+        total += value_at(scale, k, i)
+    return (total / count) ** 2
 
 
 @compiled
@@ -510,8 +527,8 @@ def mean_step(scale: Scale, i: int, steps: int, without: int) -> float:
             first = square
         else:
             second = max(second, square)
-    if without == 0:
-        return squares / steps
+    if without < 2:
+        return (squares - without * first) / (steps - without)
     # These two of m squares of normal values have a sum of 3.5 log m - 2.6 on average.
     return (squares - first - second) / (steps - 3.5 * math.log(steps) + 2.6)
 

@@ -142,6 +142,18 @@ def test_a_channel_that_becomes_noisy_is_noisy_and_not_faulty(times, seed):
     assert declarations(pipeline, output)[-1] == ("imu_2.y", "FAULTY")
 
 
+def test_a_large_fault_that_a_filter_spreads_over_samples_is_named_at_once():
+    """A low-pass filter of 20 Hz: its step response is no noise."""
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    block = stream(pipeline.geometry, round(12 * RATE))
+    since = np.maximum(np.arange(len(block)) - 1000, 0) / RATE
+    block.z[:, 4] += 1.0 - np.exp(-since / 0.012)
+    output = pipeline.process(block)
+    assert declarations(pipeline, output)[-1] == ("imu_2.y", "FAULTY")
+    named = [event for event in output.events if event.after == ChannelState.FAULTY]
+    assert (named[0].stamp - START) / 1e9 < 10.1
+
+
 @pytest.mark.parametrize(("rate", "hours"), [(1e-4, 1.0), (1e-3, 2.0), (0.1, 0.5)])
 def test_the_prior_of_a_fault_is_that_of_its_rate_over_the_exposure_in_hours(
     rate, hours
