@@ -26,7 +26,6 @@ from fdi_ros.mavlink.failover_policy import Imu
 from fdi_ros.mavlink.protocol import MS, NS, Vector
 
 AVERAGED = 120 * MS  #: Differences are averaged over the samples of this time, ns.
-SPANNED = AVERAGED // 2  #: A mean of samples within less time is not known, ns.
 CURRENT = 500 * MS  #: Oldest pair of samples that still counts, ns.
 #: Time constant with which the recent largest size decays, s. Once the IMU has agreed
 #: for `HEALED`, only the present size counts.
@@ -43,9 +42,15 @@ CLEAR = 0.5
 #: Share of the rate by which two healthy gyros may differ: scales of one type differ by up
 #: to 3 %, which is more than `CLEAR` in a turn of 17 rad/s.
 SCALE = 0.05
-#: An error is no oscillation if its mean is this share of its standard deviation: a mean of
-#: 120 ms leaves less of vibration that seems faster than 5 Hz.
-STEADY = 1.0
+#: A difference is steady if it is a smooth curve: its mean is this multiple of its step
+#: from sample to sample, over the root of 2. Vibration at 111 Hz reaches 9 with loops of
+#: 400 Hz, in which ArduPilot sends what is due each 9 ms at uneven times.
+SMOOTH = 10.0
+#: Or if it lasts: in this number of times `AVERAGED` in turn all means have one sign and
+#: are at least as large as the standard deviation.
+WINDOWS = 4
+#: An oscillation had the other sign, and half the size, within this time, ns.
+TURNED = 300 * MS
 #: An IMU that the monitor doubts agrees only while the difference scatters by less, rad/s,
 CALM = 0.1
 #: and once another one has turned by this, rad/s: a dead gyro agrees with one at rest.
@@ -93,6 +98,7 @@ class Difference(NamedTuple):
     mean: Vector  #: rad/s
     spread: Vector  #: Standard deviation of one difference, rad/s.
     std: Vector  #: Standard deviation of the mean, rad/s.
+    steady: tuple[bool, ...]  #: Whether each axis differs steadily.
 
     @property
     def size(self) -> float:
@@ -118,6 +124,8 @@ class RawComparison:
         self._longest = 7 * interval // 5
         self._lag = max(1, SKEW // interval)
         self._averaged = max(1, AVERAGED // interval)
+        #: Fewest samples that are averaged, and the number of those within `QUICK`.
+        self.fewest = max(FEWEST, QUICK // interval + 1)
         self._last: list[tuple[int, Vector]] = [(-NS, UNKNOWN)] * count
         self._recent: list[deque[Vector]] = [deque(maxlen=KEPT) for _ in range(count)]
         self._pairs: dict[tuple[int, int], deque[tuple[int, Vector]]] = {
@@ -152,7 +160,7 @@ class RawComparison:
             if abs(first_stamp - second_stamp) < self._reach:
                 x, y, z = (a - b for a, b in zip(first, second, strict=True))
                 rows.append((stamp, (x, y, z)))
-            while rows and rows[0][0] <= stamp - AVERAGED:
+            while rows and rows[0][0] <= stamp - WINDOWS * AVERAGED:
                 rows.popleft()
 
     def _is_left_behind(self, unit: int) -> bool:
@@ -206,17 +214,24 @@ class RawComparison:
                 largest[axis] = max(largest[axis], change)
         return largest[0], largest[1], largest[2]
 
-    def steady(self, unit: int, other: int, count: int, now: int) -> Vector:
-        """Return the smallest of the last count differences of two IMUs, by axis, rad/s.
+    def steady(self, unit: int, other: int, now: int) -> Vector:
+        """Return the smallest difference of two IMUs within `QUICK`, by axis, rad/s.
 
-        0 where the differences do not all have the same sign. NaN: fewer are known at
+        0 where the differences oscillate: they do not all have the same sign, are no
+        smooth curve, or had the other sign within `TURNED`. NaN: too few are known at
         time now, ns.
         """
         rows = self._rows(unit, other, now)
-        if len(rows) < count:
+        if len(rows) < self.fewest:
             return UNKNOWN
-        columns = zip(*(row for _, row in rows[-count:]), strict=True)
-        x, y, z = map(_steady, columns)
+        if max(map(abs, rows[-1][1])) < LARGE:
+            return 0.0, 0.0, 0.0
+        before = np.array([row for at, row in rows if at > rows[-1][0] - TURNED])
+        values = before[-self.fewest :]
+        least = np.array(list(map(_steady, values.T.tolist())))
+        smooth = np.abs(values.mean(axis=0)) >= SMOOTH * _roughness(values)
+        turned = (2.0 * before * np.sign(least) < -np.abs(least)).any(axis=0)
+        x, y, z = np.where(smooth & ~turned, least, 0.0).tolist()
         return x, y, z
 
     def between(
@@ -227,21 +242,26 @@ class RawComparison:
         Not known: no recent pairs, or too few or too far apart in time to show an
         oscillation.
 
-        last: number of samples averaged. 0: all within `AVERAGED`, over `SPANNED` at
-        least.
+        last: number of samples averaged. 0: all within `AVERAGED`, and at least
+        `fewest`.
         """
-        rows = self._rows(unit, other, now)[-last:]
-        stamps = [stamp for stamp, _ in rows]
-        gaps = [after - before for before, after in pairwise(stamps)]
-        if not gaps or len(rows) < last or min(gaps) > self._longest:
+        rows = self._rows(unit, other, now)
+        ages = [rows[-1][0] - at for at, _ in rows]
+        count = last or max(self.fewest, sum(age < AVERAGED for age in ages))
+        if len(rows) < max(2, count) or now - rows[-count][0] > CURRENT:
             return None
-        if not last and (len(rows) <= FEWEST or sum(gaps) < SPANNED):
+        if min(before - after for before, after in pairwise(ages)) > self._longest:
             return None
         values = np.array([difference for _, difference in rows])
-        mean = values.mean(axis=0)
-        spread = values.std(axis=0, ddof=1)
-        std = spread / math.sqrt(len(rows))
-        return Difference(*(tuple(row.tolist()) for row in (mean, spread, std)))
+        late = values[-count:]
+        mean = late.mean(axis=0)
+        spread = late.std(axis=0, ddof=1)
+        std = spread / math.sqrt(count)
+        steady = np.abs(mean) >= SMOOTH * _roughness(late)
+        if (~steady & (np.abs(mean) >= spread)).any():
+            steady |= _lasts(values, np.array(ages) // AVERAGED)
+        x, y, z = (tuple(row.tolist()) for row in (mean, spread, std))
+        return Difference(x, y, z, tuple(steady.tolist()))
 
     def _rows(self, unit: int, other: int, now: int) -> list[tuple[int, Vector]]:
         """Return times and differences of late of two IMUs. Empty: none is recent."""
@@ -250,6 +270,24 @@ class RawComparison:
             return []
         sign = 1.0 if unit < other else -1.0
         return [(at, (sign * x, sign * y, sign * z)) for at, (x, y, z) in rows]
+
+
+def _roughness(values: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of white noise that steps as much, by column."""
+    rough: np.ndarray = np.sqrt(np.mean(np.diff(values, axis=0) ** 2, axis=0) / 2.0)
+    return rough
+
+
+def _lasts(values: np.ndarray, window: np.ndarray) -> np.ndarray:
+    """Return which columns have one sign in all windows, and means beyond their spread."""
+    parts = [values[window == k] for k in range(WINDOWS)]
+    if min(map(len, parts)) < FEWEST:
+        return np.zeros(values.shape[1], dtype=bool)
+    means = np.array([part.mean(axis=0) for part in parts])
+    stds = np.array([part.std(axis=0, ddof=1) for part in parts])
+    one_sign = np.abs(np.sign(means).sum(axis=0)) == WINDOWS
+    lasting: np.ndarray = one_sign & (np.abs(means) >= stds).all(axis=0)
+    return lasting
 
 
 def _steady(values: Sequence[float]) -> float:
@@ -285,7 +323,6 @@ class Evidence:
         self._nearby = [math.nan] * count
         self._bounded = [math.nan] * count
         self._min_size = min_size
-        self._fewest = max(FEWEST, QUICK // interval + 1)
         self._sized = SIZED // interval
         # States of the three channels of each IMU. Empty: unknown.
         self._states: list[tuple[ChannelState, ...]] = [()] * count
@@ -399,15 +436,13 @@ class Evidence:
             sizes = [math.nan] * 3
             bound = [math.nan] * 3
             if difference is not None:
-                quick = self.raw.steady(j, k, self._fewest, now)
+                quick = self.raw.steady(j, k, now)
                 scale = SCALE * min(self.raw.rate(j), self.raw.rate(k))
                 for axis, mean in enumerate(difference.mean):
                     spread = difference.spread[axis]
                     size = max(0.0, abs(mean) - scale)
                     is_wild = math.hypot(mean, spread) >= WILD + scale
-                    is_steady = (
-                        abs(mean) >= STEADY * spread or abs(quick[axis]) >= LARGE
-                    )
+                    is_steady = difference.steady[axis] or abs(quick[axis]) >= LARGE
                     sizes[axis] = size if is_steady else WILD if is_wild else 0.0
                     bound[axis] = max(size, spread if spread >= CALM else 0.0)
             for pair in ((j, k), (k, j)):
@@ -520,7 +555,7 @@ class Evidence:
             return False
         for k in others:
             refuted = self._refuted[k]
-            if refuted is None or self.raw.repeats(k, self._fewest):
+            if refuted is None or self.raw.repeats(k, self.raw.fewest):
                 return False
             if not self._doubts(k) <= refuted | self._doubts(unit):
                 return False
@@ -564,12 +599,12 @@ class Evidence:
         Farther than scales explain, and than the others turn within `SKEW`.
         """
         first, second = (k for k in units if k != unit)
-        count = self._fewest
+        count = self.raw.fewest
         turning = max(self.raw.rate(first), self.raw.rate(second))
         limit = (LARGE if self._doubts(unit) else CLEAR) + SCALE * turning
         rows = zip(
-            self.raw.steady(unit, first, count, now),
-            self.raw.steady(unit, second, count, now),
+            self.raw.steady(unit, first, now),
+            self.raw.steady(unit, second, now),
             self.raw.steps(first, count),
             self.raw.steps(second, count),
             strict=True,
@@ -593,7 +628,7 @@ class Evidence:
         ]
         if not found:
             return None
-        mean, _, std = min(found)[2]
+        mean, _, std, _ = min(found)[2]
         axis = max(range(3), key=lambda k: abs(mean[k]))
         others = [abs(mean[k]) for k in range(3) if k != axis]
         if max(others) > WHOLE * abs(mean[axis]):

@@ -20,6 +20,7 @@ from fdi_ros.mavlink.failover_policy import Imu
 MS = 1_000_000
 NS = 1000 * MS
 STEP = 20 * MS
+NINE = 9 * MS  #: Interval of the messages of a link at 50 Hz.
 START = 1000 * NS
 OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED = map(int, list(ChannelState)[:6])
 
@@ -36,10 +37,20 @@ def zero(rate: np.ndarray) -> Sequence[float]:
 
 
 class Watched:
-    """Evidence of IMUs in a vehicle that turns by up to 1 rad/s, with noise of 2 mrad/s."""
+    """Evidence of IMUs in a vehicle that turns by up to 1 rad/s, with noise of 2 mrad/s.
 
-    def __init__(self, count: int = 3) -> None:
-        self.evidence = Evidence(count, STEP, min_size=0.03)
+    Samples come each interval, ns, at the next turn of the autopilot's loop, Hz, with
+    stamps in whole milliseconds.
+    """
+
+    def __init__(
+        self, count: int = 3, interval: int = STEP, loop: float = 1000.0
+    ) -> None:
+        self.evidence = Evidence(count, interval, min_size=0.03)
+        self.interval = interval
+        self.loop = loop
+        self.sent = self.looked = 0
+        self.t = 0.0  # time of the last samples since the start, s
         self.gyros: list[Gyro] = [sound] * count
         self.states = [OK] * 3 * count
         self.out: list[int] = []
@@ -53,13 +64,15 @@ class Watched:
         return np.array([math.sin(2.1 * t), 0.8 * math.cos(1.7 * t), 0.3 * math.sin(t)])
 
     def run(self, seconds: float) -> "Watched":
-        for _ in range(round(seconds * NS / STEP)):
+        for _ in range(round(seconds * NS / self.interval)):
             self.step()
         return self
 
     def step(self) -> Sequence[Imu]:
-        self.now += STEP
-        rate = self.rate((self.now - START) / NS)
+        self.sent += self.interval
+        self.t = math.ceil(self.sent / NS * self.loop - 1e-6) / self.loop
+        self.now = START + int(self.t * 1000.0 + 1e-6) * MS
+        rate = self.rate(self.t)
         for unit, gyro in enumerate(self.gyros):
             noisy = rate + self.random.normal(0.0, 0.002, 3)
             x, y, z = (round(value, 3) for value in map(float, gyro(noisy)))
@@ -67,12 +80,15 @@ class Watched:
         if self.is_reporting:
             self.evidence.hear(self.states, self.now)
         delivers = [True] * len(self.gyros)
+        if self.now - self.looked < 3 * STEP // 4:
+            return self.evidence.imus
+        self.looked = self.now
         return self.evidence.look(delivers, self.out, self.now)
 
     def blamed(self, seconds: float) -> set[int]:
         """Return the IMUs, from 0, that are blamed at some time of the next seconds."""
         found: set[int] = set()
-        for _ in range(round(seconds * NS / STEP)):
+        for _ in range(round(seconds * NS / self.interval)):
             found |= {k for k, imu in enumerate(self.step()) if imu.blamed}
         return found
 
@@ -298,6 +314,80 @@ def test_an_imu_that_oscillates_and_is_named_does_not_agree(
     assert watched.evidence.bound(0) > 0.1, "the monitor's name is not contradicted"
 
 
+def vibrating(
+    watched: Watched, size: float, frequency: float, bias: float = 0.0
+) -> Gyro:
+    """Return a gyro that vibrates about x, rad/s and Hz, with an error on the same axis."""
+
+    def gyro(rate: np.ndarray) -> Sequence[float]:
+        shaken = size * math.sin(2.0 * math.pi * frequency * watched.t)
+        return rate + np.array([shaken + bias, 0.0, 0.0])
+
+    return gyro
+
+
+@pytest.mark.parametrize("loop", [400.0, 300.0])
+def test_a_vibration_that_is_named_is_no_error(loop: float) -> None:
+    """Each frequency is near a sum of multiples of the rates of messages and of the loop."""
+    watched = Watched(interval=NINE, loop=loop)
+    for frequency in (65.5, 69.0, 78.0, 105.0, 116.5, 133.3, 155.6, 187.0):
+        watched.states[6] = FAULTY
+        watched.gyros[2] = vibrating(watched, 0.8, frequency)
+        assert not watched.blamed(1.5), frequency
+        watched.gyros[2] = sound
+        watched.run(0.5)
+
+
+def test_an_error_beside_a_vibration_is_blamed_all_the_same() -> None:
+    watched = Watched(interval=NINE, loop=400.0)
+    watched.states[6] = FAULTY
+    watched.gyros[2] = vibrating(watched, 0.2, 66.0)
+    assert not watched.blamed(2.0)
+    watched.gyros[2] = vibrating(watched, 0.2, 66.0, bias=0.3)
+    assert watched.blamed(0.7) == {2}
+
+
+def test_an_imu_that_has_healed_agrees_under_usual_vibration() -> None:
+    watched = Watched(interval=NINE, loop=400.0)
+    watched.states[0] = FAULTY
+    watched.out = [0]
+    watched.gyros[0] = biased(1.0)
+    assert watched.run(1.0).step()[0].agreed is None
+    watched.gyros = [vibrating(watched, 0.08, f) for f in (80.0, 91.0, 73.0)]
+    assert watched.run(1.0).step()[0].agreed is not None
+
+
+@pytest.mark.parametrize("frequency", [49.8, 90.0, 99.7])
+def test_a_pause_of_the_messages_makes_no_error_of_a_vibration(
+    frequency: float,
+) -> None:
+    """After it the mean is of one sample, and nothing is known of the spread."""
+    watched = Watched(interval=NINE, loop=400.0)
+    watched.states[6] = FAULTY
+    watched.gyros[2] = vibrating(watched, 0.3, frequency)
+    watched.run(1.0)
+    for pause in (8, 14, 20):
+        watched.sent += pause * NINE
+        assert not watched.blamed(0.4)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
+def test_an_error_over_a_link_that_loses_messages_is_blamed(share: float) -> None:
+    watched = Watched(interval=NINE, loop=400.0)
+    lost = np.random.default_rng(3)
+    feed = watched.evidence.raw.feed
+
+    def lossy(unit: int, stamp: int, rate: tuple[float, float, float]) -> None:
+        if lost.random() >= share:
+            feed(unit, stamp, rate)
+
+    watched.evidence.raw.feed = lossy  # type: ignore[method-assign]
+    watched.run(1.0)
+    watched.states[6] = FAULTY
+    watched.gyros[2] = biased(0.3)
+    assert watched.blamed(0.25 if share < 0.3 else 0.5) == {2}
+
+
 def test_a_dead_gyro_with_noise_does_not_agree_in_a_quiet_hover() -> None:
     """Its rate differs from the others' only while they turn."""
     watched = Watched()
@@ -346,8 +436,8 @@ def test_samples_that_come_too_slowly_or_too_fast() -> None:
             slow.feed(unit, START + 2 * k * STEP, (0.1 * unit, 0.0, 0.0))
             fast.feed(unit, START + k * STEP // 4, (0.1 * unit, 0.0, 0.0))
     assert slow.between(0, 1, START + 400 * STEP) is None
-    assert fast.between(0, 1, START + 50 * STEP, 8) is not None
-    assert fast.between(0, 1, START + 50 * STEP, 9) is None
+    assert fast.between(0, 1, START + 50 * STEP, 32) is not None
+    assert fast.between(0, 1, START + 50 * STEP, 33) is None
 
 
 def test_a_set_that_flickers_names_its_imu() -> None:
