@@ -43,9 +43,9 @@ CLEAR = 0.5
 #: to 3 %, which is more than `CLEAR` in a turn of 17 rad/s.
 SCALE = 0.05
 #: A difference is steady if it is a smooth curve: its mean is this multiple of its step
-#: from sample to sample, over the root of 2. Vibration at 111 Hz reaches 9 with loops of
-#: 400 Hz, in which ArduPilot sends what is due each 9 ms at uneven times.
-SMOOTH = 10.0
+#: from sample to sample, over the root of 2. ArduPilot sends what is due each 9 ms at the
+#: turns of its loop, so vibration reaches more only within 1 Hz of 111 Hz.
+SMOOTH = 5.0
 #: Or if it lasts: in this number of times `AVERAGED` in turn all means have one sign and
 #: are at least as large as the standard deviation.
 WINDOWS = 4
