@@ -50,6 +50,7 @@ from fdi_ros.detectors.sums import (
 )
 from fdi_ros.estimator.error_states import ErrorStates, copy_states
 from fdi_ros.estimator.estimator import (
+    BLOCK_TIME,
     LEAST_SHARE,
     LONG_TIME,
     SNAPSHOT_TIME,
@@ -58,7 +59,13 @@ from fdi_ros.estimator.estimator import (
     Estimator,
     update_weights,
 )
-from fdi_ros.estimator.noise import BLOCK, SAMPLE, SCALES, update_unknown
+from fdi_ros.estimator.noise import (
+    BLOCK,
+    SAMPLE,
+    SCALES,
+    THREE_SIGMA,
+    update_unknown,
+)
 from fdi_ros.estimator.snapshots import (
     is_after_hole,
     move_biases,
@@ -108,6 +115,10 @@ MOVE_TIME = 1.0
 """Age of a fault, s, from which it must exceed what healthy biases move in flight. In simulated
 thermal shocks of 6 mrad/s a healthy gyro is named in 17 of 48 flights without this, in 9
 with 5 s, and in 2 with 1 s."""
+STARTS = 0.25  # s within which a boost or motors start
+UNSTEADY = 0.25
+"""Largest variance of the error of a channel beside noise, over the square of its mean, that is
+still a shift: sines, as gains and delays show in turns, have much more."""
 LONGEST_WAIT = 0.5
 """Longest time from a refused case to the next one, s. Another fault is named nearly as soon as
 without the refused case."""
@@ -455,7 +466,7 @@ def explain_beside_moves(params: Constants, state: State, size: int) -> bool:
     inference.may_shift = case.isolated == 0 and params.bias_move > 0.0
     explain_case(params, state.estimator, case, size, 0.0)
     age = (state.estimator.samples - case.onset) * params.period
-    shifted = inference.shift > 0.0 and inference.fitted
+    shifted = inference.shift > 0.0 and inference.fitted and is_steady(params, state)
     if (
         shifted
         and lately_moved(state) + inference.shift <= LARGEST_MOVES * params.largest_move
@@ -531,6 +542,27 @@ def mean_step(scale: Scale, i: int, steps: int, without: int) -> float:
         return (squares - without * first) / (steps - without)
     # These two of m squares of normal values have a sum of 3.5 log m - 2.6 on average.
     return (squares - first - second) / (steps - 3.5 * math.log(steps) + 2.6)
+
+
+@compiled
+def is_steady(params: Constants, state: State) -> bool:
+    """Whether the errors of all channels have stayed the same since `STARTS` after the onset.
+
+    A gain or a delay of a unit varies with the motion, a shift of the biases does not.
+    """
+    kf = state.estimator
+    scale = state.scales[BLOCK]
+    seconds = (kf.samples - state.case.onset) * params.period - STARTS
+    count = min(int(seconds / BLOCK_TIME), scale.kept)
+    for i in range(params.sensors.n):
+        total = squares = 0.0
+        for back in range(count):
+            value = value_at(scale, back, i)
+            total += value
+            squares += value * value
+        if count * squares > (1.0 + UNSTEADY) * total * total + THREE_SIGMA * count**2:
+            return False
+    return True
 
 
 @compiled

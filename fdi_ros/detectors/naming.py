@@ -539,9 +539,8 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
         some_whole = some_whole or inference.whole[best] != 0
         if inference.shifts[best] > 0.0:
             inference.may_be_shift = True
-    # A unit with errors in all its channels is a set, not names: the error of some
-    # channels may be very small.
-    few = common & (common - 1) & ((common & (common - 1)) - 1) == 0
+    # Three channels are a unit. All pairs in it are unlikely, so each of the three is faulty.
+    few = checks(common, n) <= 0
     named = inference.fitted and common > 0 and few and not some_whole
     inference.common = common if named else 0
     explained = inference.fitted and inference.shift == 0.0

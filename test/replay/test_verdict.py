@@ -68,6 +68,16 @@ needs_cases = pytest.mark.skipif(
             4,
             r"LOOK: no fault .*/imu_1 is left out: stamps come in bursts of about 5",
         ),
+        (
+            CASES / "unit_times_eight.csv",
+            3,
+            r"FAULTY: imu_1, all axes, from \d+\.\d s\. .* First seen at 15\.0 s\.",
+        ),
+        (
+            CASES / "offset_then_other_drops_out.csv",
+            3,
+            r"FAULTY: imu_1, all axes, from \d+\.\d s\. .* First seen at 15\.0 s\.",
+        ),
         (CASES / "mcap_message_zstd", 0, r"HEALTHY: .*9 channels"),
         (CASES / "clean.csv", 0, r"HEALTHY: "),
         (
