@@ -30,7 +30,8 @@ CURRENT = 500 * MS  #: Oldest pair of samples that still counts, ns.
 #: Time constant with which the recent largest size decays, s. Once the IMU has agreed
 #: for `HEALED`, only the present size counts.
 DECAY = 0.5
-BREAK = 100 * MS  #: A shorter break does not end an agreement, ns.
+REFUTING = 300 * MS  #: Agreement refutes a doubt that has stood for this time, ns.
+BREAK = 100 * MS  #: A shorter break ends no agreement, and no difference, ns.
 HEALED = NS // 2  #: Time of agreement after which an earlier size is forgotten, ns.
 LASTING = 300 * MS  #: A set must stand for this time to name an IMU, ns,
 GAP = 200 * MS  #: without a break longer than this, ns.
@@ -319,6 +320,8 @@ class Evidence:
         # Difference of each pair, and a bound on it with oscillations.
         self._apart: Apart = {}
         self._bound: Apart = {}
+        self._means: Apart = {}  # the mean, steady or not
+        self._compared: dict[tuple[int, int], int] = {}  # when each was last known, ns
         # The same of each IMU and the nearest other one now, rad/s. NaN: unknown.
         self._nearby = [math.nan] * count
         self._bounded = [math.nan] * count
@@ -329,6 +332,9 @@ class Evidence:
         self._sizes = [UNKNOWN] * count  # largest of late, by axis, rad/s
         # Doubts of the monitor that agreement has refuted. None: the IMU is not trusted.
         self._refuted: list[set[ChannelState] | None] = [None] * count
+        # Doubts of the monitor about each IMU, and since when, ns.
+        self._doubted: list[set[ChannelState]] = [set()] * count
+        self._doubted_at = [0] * count
         # Axes of each IMU that are FAULTY or in a set; since when the IMU agrees
         # although they are, ns; and the axes for which this has lasted for `TRUSTED`.
         self._named: list[set[int]] = [set()] * count
@@ -433,9 +439,14 @@ class Evidence:
         """
         for j, k in combinations(units, 2):
             difference = self.raw.between(j, k, now)
+            if difference is None and now - self._compared.get((j, k), 0) <= BREAK:
+                # Of a lossy link: the last values hold.
+                continue
             sizes = [math.nan] * 3
             bound = [math.nan] * 3
+            means = [math.nan] * 3
             if difference is not None:
+                self._compared[j, k] = now
                 quick = self.raw.steady(j, k, now)
                 scale = SCALE * min(self.raw.rate(j), self.raw.rate(k))
                 for axis, mean in enumerate(difference.mean):
@@ -443,22 +454,29 @@ class Evidence:
                     size = max(0.0, abs(mean) - scale)
                     is_wild = math.hypot(mean, spread) >= WILD + scale
                     is_steady = difference.steady[axis] or abs(quick[axis]) >= LARGE
+                    means[axis] = size
                     sizes[axis] = size if is_steady else WILD if is_wild else 0.0
                     bound[axis] = max(size, spread if spread >= CALM else 0.0)
             for pair in ((j, k), (k, j)):
                 self._apart[pair] = sizes[0], sizes[1], sizes[2]
                 self._bound[pair] = bound[0], bound[1], bound[2]
+                self._means[pair] = means[0], means[1], means[2]
 
     def _note_trust(self, units: Sequence[int], now: int) -> None:
         """Note whether all IMUs agree, and which are apart from all others."""
         pairs = list(combinations(units, 2))
         stuck = any(map(self.raw.is_stuck, units))
-        agree = pairs and all(max(self._bound[pair]) < self._min_size for pair in pairs)
+        agree = pairs and all(max(self._apart[pair]) < self._min_size for pair in pairs)
         self._together = (self._together or now) if agree and not stuck else None
         for k in units:
+            doubts = self._doubts(k)
+            if doubts != self._doubted[k]:
+                self._doubted[k] = doubts
+                self._doubted_at[k] = now
             own = [max(self._apart[k, j]) for j in units if j != k]
             if self._together is not None and now - self._together >= TRUSTED:
-                self._refuted[k] = self._doubts(k)
+                is_old = now - self._doubted_at[k] >= REFUTING
+                self._refuted[k] = doubts if is_old else self._refuted[k] or set()
             elif all(size >= self._min_size for size in own):
                 self._refuted[k] = None
 
@@ -549,7 +567,7 @@ class Evidence:
         if len(others) != 2 or unit not in units:
             return False
         size = min(max(self._apart[unit, k]) for k in others)
-        if not max(self._bound[others[0], others[1]]) < max(
+        if not max(self._means[others[0], others[1]]) < max(
             self._min_size, ALIKE * size
         ):
             return False

@@ -209,6 +209,21 @@ def test_with_a_limit_a_worse_imu_is_announced_and_stays(tmp_path: Path) -> None
     assert "IMU 3 faulty AND IN USE: land" in flying.texts
 
 
+def test_over_a_lossy_link_an_imu_that_is_named_for_ever_is_a_witness(
+    tmp_path: Path,
+) -> None:
+    """IMU 3 has healed, but stays declared: the next fault is in a set of IMU 1 and 2."""
+    autopilot = Autopilot("ardupilot", loss=0.2)
+    talk = Monitored(tmp_path, autopilot).run(10.0)
+    autopilot.armed = True
+    talk.run(3.0)
+    talk.fault(3, 0.3, seconds=4.0)
+    talk.fault(3, 0.0, seconds=7.0)
+    talk.states[:6] = [OK, AMBIGUOUS, OK] * 2
+    talk.fault(1, 0.2, [OK, AMBIGUOUS, OK], seconds=3.0)
+    assert talk.in_use == [False, True, True]
+
+
 @pytest.mark.parametrize("frequency", [49.8, 99.7])
 def test_a_pause_of_the_link_makes_no_error_of_vibration(
     tmp_path: Path, frequency: float
