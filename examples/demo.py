@@ -145,8 +145,8 @@ def _introduction(
         f" {', '.join(units)}, three\naxes each. {fault.start:g} s after the start"
         f" {', '.join(sorted(struck))} goes wrong: the demo adds\n    {fault}\n"
         "The monitor should name that gyro, and no other. In the first turn, at 8 s, all gyros are\n"
-        "UNCHECKED for 0.3 s, but stay in use: only a turn shows whether one IMU measures later\n"
-        "than the other. Below: its residual (how far each gyro\n"
+        "UNCHECKED for 0.3 s, but stay in use: a turn excites errors that rest does not show, as\n"
+        "of delays. Below: its residual (how far each gyro\n"
         "is from what the others measure), its state, and the evidence for a fault, which\n"
         "names a gyro when it reaches the threshold.\n"
     )

@@ -200,6 +200,9 @@ class MonitorNode(CheckedNode, LifecycleNode):
             self._check(self._running)
 
     def _check(self, running: Running) -> None:
+        # An event outlives its timer where the node is cleaned up before its turn.
+        if running is not self._running:
+            return
         self._checked_at = time.monotonic()
         self.save_state()
         running.check()

@@ -116,6 +116,11 @@ for file in ({str(parameter_file(TWO_IMUS, tmp_path))!r}, {str(dump)!r}):
     with open({str(dump)!r}, "w") as out:
         yaml.safe_dump({{"/drone/fdi_node": {{"ros__parameters": values}}}}, out)
     print(node.prefix, sorted(values.items()))
+    # The executor may hold an event of the timer of the checks over a cleanup.
+    node.trigger_configure()
+    checks = node._timer.callback
+    node.trigger_cleanup()
+    checks()
     node.destroy_node()
     rclpy.shutdown()
 """
