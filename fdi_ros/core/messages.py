@@ -39,7 +39,7 @@ _SIGN = 1 << 31
 #: Latest whole second that the header of a message can hold, ns.
 LAST_STAMP = (_SIGN - 1) * _NS
 # Index in the upper triangle of each element of a symmetric (3, 3) matrix, by rows.
-_FULL = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
+FROM_TRIANGLE = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 _IN_ORDER = np.arange(MAX_CHANNELS)
 
 
@@ -241,7 +241,7 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
         out[ENCAPSULATION + k] = seconds >> 8 * k & 255
         out[ENCAPSULATION + 4 + k] = rest >> 8 * k & 255
     _write_doubles(out, at, rate, _IN_ORDER, 3)
-    _write_doubles(out, at + 24, covariance, _FULL, 9)
+    _write_doubles(out, at + 24, covariance, FROM_TRIANGLE, 9)
     for k in range(3):
         _write_double(out, at + 8 * (IMU_BEFORE_FORCE + k), 0.0)
     for k in range(9):
@@ -260,7 +260,7 @@ def fill_force(
     for k in range(3):
         _write_double(out, start + 8 * k, natural * force[k])
     for k in range(9):
-        value = natural * natural * covariance[_FULL[k]]
+        value = natural * natural * covariance[FROM_TRIANGLE[k]]
         _write_double(out, start + 24 + 8 * k, value)
 
 

@@ -32,14 +32,14 @@ from fdi_ros.detectors.naming import (
     FEW_CHECKS,
     MISFIT,
     Inference,
-    checks,
     explain,
+    redundancy,
     set_mean,
     unexplained,
 )
 from fdi_ros.detectors.sums import (
+    BLOCKS_PER_VALUE,
     KEPT,
-    PER_BLOCK,
     SIZES,
     Scale,
     Scales,
@@ -207,7 +207,7 @@ def look_for_case(params: Constants, state: State) -> None:
             continue
         since, evidence = look_back(params, kf, scale, channel, sign)
         evidence = min(evidence, since * math.log(kf.noise.cap[at, channel]))
-        samples = max(PER_BLOCK[at] * params.length, 1)
+        samples = max(BLOCKS_PER_VALUE[at] * params.length, 1)
         if since >= 2 and since * samples >= params.least and evidence >= best:
             best = evidence
             found = True
@@ -590,7 +590,7 @@ def gives_up(params: Constants, state: State, seconds: float) -> bool:
     # The snapshots are wrong too, and too certain: discard them.
     for tier in range(TIERS):
         kf.taken[tier] = 0
-    kf.noise.lived[kf.noise.regime] = 0.0
+    kf.noise.regime_seconds[kf.noise.regime] = 0.0
     update_unknown(kf.noise, params.sensors.n, 0.0)
     forget_evidence(params, state)
     update_weights(params, kf)
@@ -645,7 +645,7 @@ def time_to_settle(params: Constants, inference: Inference) -> float:
         return SETTLED_TOGETHER
     if inference.log_odds >= CLEAR:
         return 0.0
-    if checks(inference.mask, params.sensors.n) > FEW_CHECKS:
+    if redundancy(inference.mask, params.sensors.n) > FEW_CHECKS:
         return SETTLED
     return SETTLED_AMONG_FEW
 
@@ -693,7 +693,7 @@ def let_biases_move(params: Constants, state: State, std: float) -> None:
     move_biases(params, kf, std, 0.5 * params.largest_move / WARMS)
     # A bias that moves as a turn begins has been learned as a scale error.
     widen_scales(params, kf.states)
-    kf.noise.lived[kf.noise.regime] = 0.0
+    kf.noise.regime_seconds[kf.noise.regime] = 0.0
     update_unknown(kf.noise, n, 0.0)
     forget_evidence(params, state)
     update_weights(params, kf)

@@ -232,9 +232,11 @@ def add_noise(
         noise = noise_of_mean(params, kf.noise, i, size)
         noise += inference.louder[i] / size
         speed = moves * (kf.total.speed[i] - inference.before.speed[i]) / size
-        bent = params.nonlinearity[i] * speed
+        nonlinear_error = params.nonlinearity[i] * speed
         moved = inference.moved * inference.moved
-        inference.covariance[i, i] += noise + kf.peak_extra[i] * part + bent * bent
+        inference.covariance[i, i] += (
+            noise + kf.peak_extra[i] * part + nonlinear_error * nonlinear_error
+        )
         inference.covariance[i, i] += kf.displaced[i] * part + moved
         place = params.layout.delays[params.unit[i]]
         if place >= 0:
@@ -257,7 +259,7 @@ def add_line(params: Constants, kf: Estimator, inference: Inference, size: int) 
 
 
 @compiled
-def checks(mask: int, n: int) -> int:
+def redundancy(mask: int, n: int) -> int:
     """Return how many channels a set has beyond the three that determine a rate."""
     count = -3
     for i in range(n):
@@ -345,7 +347,7 @@ def set_direction(inference: Inference, n: int, k: int, channel: int) -> None:
 @compiled
 def add_channels(inference: Inference, n: int) -> None:
     """Add each channel, and each pair where enough checks exist."""
-    free = checks(inference.mask, n)
+    free = redundancy(inference.mask, n)
     information = inference.parity.information
     for i in range(n):
         inference.error[i] = 0.0
@@ -424,7 +426,7 @@ def add_shifts(inference: Inference, n: int, largest: float) -> None:
 
     ``largest`` is the size of the largest one, rad/s.
     """
-    few = checks(inference.mask, n) <= FEW_CHECKS
+    few = redundancy(inference.mask, n) <= FEW_CHECKS
     prior = math.log((SHIFTED_AMONG_FEW if few else SHIFTED) / SHIFTS)
     std = SMALLEST_SHIFT * largest
     set_direction(inference, n, 0, -1)
@@ -495,7 +497,7 @@ def update_best(inference: Inference, n: int) -> None:
     inference.likeliest = inference.members[best]
     inference.shift = inference.shifts[best]
     inference.fit_of_best = inference.fits[best]
-    free = checks(inference.mask & ~inference.likeliest, n)
+    free = redundancy(inference.mask & ~inference.likeliest, n)
     inference.fitted = 2.0 * (
         inference.total - inference.fit_of_best
     ) <= FIT + FIT_PER_CHECK * max(free, 0)
@@ -540,7 +542,7 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
         if inference.shifts[best] > 0.0:
             inference.may_be_shift = True
     # Three channels are a unit. All pairs in it are unlikely, so each of the three is faulty.
-    few = checks(common, n) <= 0
+    few = redundancy(common, n) <= 0
     named = inference.fitted and common > 0 and few and not some_whole
     inference.common = common if named else 0
     explained = inference.fitted and inference.shift == 0.0
@@ -579,7 +581,7 @@ def unexplained(inference: Inference, n: int) -> float:
     for i in range(n):
         if inference.mask >> i & 1:
             trace += inference.parity.information[i, i]
-    square = max(2.0 * inference.total - checks(inference.mask, n), 0.0) / max(
+    square = max(2.0 * inference.total - redundancy(inference.mask, n), 0.0) / max(
         trace, 1e-12
     )
     return math.sqrt(square)

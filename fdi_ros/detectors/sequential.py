@@ -56,9 +56,9 @@ from fdi_ros.estimator.error_states import (
 )
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
+    BLOCKS_PER_COARSE,
     LONG_TIME,
     SNAPSHOT_TIME,
-    STRIDE,
     Constants,
     Estimator,
     add_sample,
@@ -137,7 +137,7 @@ def pass_time(params: Constants, state: State, sample: SampleInput) -> float:
         forget_evidence(params, state)
         pass_hole(params, kf, seconds)
         if seconds > PAUSE:
-            kf.noise.lived[REST] = kf.noise.lived[MOTION] = 0.0
+            kf.noise.regime_seconds[REST] = kf.noise.regime_seconds[MOTION] = 0.0
             update_unknown(kf.noise, params.sensors.n, 0.0)
         kf.mask = 0
     return seconds
@@ -214,20 +214,20 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
         kf.snapshot_at = kf.seconds
         keep_snapshot(params, kf)
     if learns:
-        take_delays_off(params, state)
+        compensate_delays(params, state)
     predict_innovation_covariance(params, kf)
     if sample.wants_excess:
         update_excess(params, kf)
-    if kf.all_blocks % STRIDE == 0:
+    if kf.all_blocks % BLOCKS_PER_COARSE == 0:
         look_for_slow_faults(params, state)
 
 
 @compiled
-def take_delays_off(params: Constants, state: State) -> None:
+def compensate_delays(params: Constants, state: State) -> None:
     """Compensate well-known delays in the values to come; runs once a second."""
     kf = state.estimator
-    if params.units > 1 and kf.seconds - kf.taken_off_at > 1.0:
-        kf.taken_off_at = kf.seconds
+    if params.units > 1 and kf.seconds - kf.delays_checked_at > 1.0:
+        kf.delays_checked_at = kf.seconds
         if transfer_delays(params, kf):
             # The evidence so far belongs to other sampling instants.
             forget_evidence(params, state)

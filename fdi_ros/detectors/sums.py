@@ -41,7 +41,7 @@ from fdi_ros.model.samples import Array
 SIZES, KEPT = 6, 64
 """Number of sizes of a fault, and of stored values of each time scale."""
 #: Blocks in a value of each time scale. The first one has samples.
-PER_BLOCK = (0, 1, 6, 48)
+BLOCKS_PER_VALUE = (0, 1, 6, 48)
 SMALLEST = 0.2
 """Smallest size of a fault, in standard deviations at its time scale. Each further size is
 twice as large, up to 6.4. Sizes in between cost at most 11 % of the delay, and smaller
@@ -233,7 +233,7 @@ def update_from_block(
                 scale.values[i] += kf.block_values[i]
                 scale.information[i] += information[i, i]
         scale.filled += 1
-        if scale.filled < PER_BLOCK[k]:
+        if scale.filled < BLOCKS_PER_VALUE[k]:
             continue
         noise.seen[k] += 1.0
         scale.newest = (scale.newest + 1) % KEPT
@@ -253,7 +253,11 @@ def update_from_block(
             scale.values[i] = scale.information[i] = 0.0
         scale.filled = 0
         add_evidence(
-            params, kf, scale, k, kf.samples - (PER_BLOCK[k] + 1) * params.length + 1
+            params,
+            kf,
+            scale,
+            k,
+            kf.samples - (BLOCKS_PER_VALUE[k] + 1) * params.length + 1,
         )
 
 

@@ -122,11 +122,11 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
             lately += h * after
             jerk += h * 2.0 * (after - before) / (ahead + behind)
         kf.angular_acceleration[i] = along if turning else 0.0
-        swift = params.timing[i] * max(
+        timing_error = params.timing[i] * max(
             max(abs(along), abs(lately)) - 2.0 * math.sqrt(noise), 0.0
         )
-        bent = params.nonlinearity[i] * speed
-        kf.extra[i] = swift * swift + bent * bent
+        nonlinear_error = params.nonlinearity[i] * speed
+        kf.extra[i] = timing_error * timing_error + nonlinear_error * nonlinear_error
         place = params.layout.delays[params.unit[i]]
         if place >= 0:
             second = states.p[place, place] + states.x[place] * states.x[place]
@@ -307,8 +307,10 @@ def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
             else PEAK * kf.peak_turn[i]
         )
         kf.peak_extra[i] = max(PEAK * kf.peak_extra[i], kf.extra[i])
-        bent = params.nonlinearity[i] * speed if moves else 0.0
-        kf.bent[i] = max(PEAK * kf.bent[i], bent * bent)
+        nonlinear_error = params.nonlinearity[i] * speed if moves else 0.0
+        kf.nonlinear_variance[i] = max(
+            PEAK * kf.nonlinear_variance[i], nonlinear_error * nonlinear_error
+        )
     for a in range(3):
         kf.signal_rate[a] = kf.rates[0, a] if moves else 0.0
     fill_signals(layout, kf.signal_rate, kf.peak_turn, kf.at.signals)

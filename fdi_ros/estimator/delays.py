@@ -8,7 +8,7 @@ from __future__ import annotations
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.estimator.estimator import Constants, Estimator
 
-TAKE_OFF = (
+LEAST_COMPENSATED_DELAY = (
     0.002  # s. A smaller delay stays an error state: its first order is accurate enough
 )
 SURE = 25.0  # squared delay over its variance from which values are moved by the delay
@@ -47,7 +47,7 @@ def transfer_delays(params: Constants, kf: Estimator) -> bool:
         place = params.layout.delays[u]
         delay = kf.states.x[place]
         variance = kf.states.p[place, place]
-        if abs(delay) > TAKE_OFF and delay * delay > SURE * variance:
+        if abs(delay) > LEAST_COMPENSATED_DELAY and delay * delay > SURE * variance:
             step = min(
                 max(delay, -LONGEST_DELAY - kf.late[u]), LONGEST_DELAY - kf.late[u]
             )

@@ -68,12 +68,12 @@ SNAPSHOT_TIME, TIERS, SNAPSHOTS = 3.0 * BLOCK_TIME, 5, 8
 """s between snapshots (three blocks), tiers, snapshots per tier. Every eighth of a tier
 enters the next."""
 REST_BLOCKS = round(1.0 / BLOCK_TIME)  # blocks without motion that are rest: a second
-STRIDE = round(LONG_TIME / BLOCK_TIME)
+BLOCKS_PER_COARSE = round(LONG_TIME / BLOCK_TIME)
 SAMPLES, BLOCKS, COARSE = (
     256,
     1024,
     512,
-)  # totals kept: of the last samples, of blocks, and of every `STRIDE`th block
+)  # totals kept: of the last samples, of blocks, and of every `BLOCKS_PER_COARSE`th block
 # Smallest share of noise in the variance of a statistic. A smaller share is rounding.
 LEAST_SHARE = 0.02
 # Smallest share of a channel's variance that must remain in its residual. With less, no
@@ -242,7 +242,7 @@ class Estimator:
     peak_turn: Channels  # lately largest, rad/s^2
     extra: Channels  # variance of a block beyond noise and states, (rad/s)^2
     peak_extra: Channels  # lately largest, (rad/s)^2
-    bent: Channels  # variance by nonlinearity, lately largest, (rad/s)^2
+    nonlinear_variance: Channels  # variance by nonlinearity, lately largest, (rad/s)^2
     displaced: Channels  # variance by unknown positions, lately largest, (rad/s)^2
     may_be_apart: Flag  # positions of accelerometers are not known
     position_std: Channels  # of them, m over the natural size
@@ -268,7 +268,7 @@ class Estimator:
     hole_sample: Whole  # number of the last sample before the hole; 0: no hole
     used_at: Real  # of the last sample that was used, s since the start
     held: Real  # s that the states have been held
-    taken_off_at: Real  # when delays were last looked at, s
+    delays_checked_at: Real  # when delays were last looked at, s
     snapshot_at: Real  # when the last snapshot was kept, s
     # Totals since the start:
     total: Total
@@ -291,7 +291,7 @@ def update_weights(params: Constants, kf: Estimator) -> None:
     lasting = 2.0 * params.length
     for i in range(n):
         # Nonlinearity bounds what any channel can show in a turn, and is not ignorance.
-        kf.growth[i] = noise.now.sample[i] + lasting * kf.bent[i]
+        kf.growth[i] = noise.now.sample[i] + lasting * kf.nonlinear_variance[i]
     fill_parity(kf.parity, params.sensors, kf.mask, kf.growth)
     for i in range(n):
         kf.known[i] = kf.parity.information[i, i]
@@ -485,8 +485,10 @@ def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) 
         return False
     close_block(params, kf)
     copy_total(n, total, kf.last_blocks[kf.all_blocks % BLOCKS])
-    if kf.all_blocks % STRIDE == 0:
-        copy_total(n, total, kf.last_coarse[kf.all_blocks // STRIDE % COARSE])
+    if kf.all_blocks % BLOCKS_PER_COARSE == 0:
+        copy_total(
+            n, total, kf.last_coarse[kf.all_blocks // BLOCKS_PER_COARSE % COARSE]
+        )
     return True
 
 
@@ -539,9 +541,9 @@ def total_before(kf: Estimator, sample: int, out: Total, n: int) -> None:
         if kept.sample < sample:
             copy_total(n, kept, out)
             return
-    found = kf.last_coarse[kf.all_blocks // STRIDE % COARSE]
-    for back in range(min(COARSE, kf.all_blocks // STRIDE)):
-        found = kf.last_coarse[(kf.all_blocks // STRIDE - back) % COARSE]
+    found = kf.last_coarse[kf.all_blocks // BLOCKS_PER_COARSE % COARSE]
+    for back in range(min(COARSE, kf.all_blocks // BLOCKS_PER_COARSE)):
+        found = kf.last_coarse[(kf.all_blocks // BLOCKS_PER_COARSE - back) % COARSE]
         if found.sample < sample:
             break
     copy_total(n, found, out)

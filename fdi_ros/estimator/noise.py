@@ -102,9 +102,9 @@ class Noise:
     longest: Channels  # largest variance of longer times over blocks
     kept: Annotated[list[Levels], 2]  # last levels at rest, in motion
     regime: Small  # `REST` or `MOTION`
-    lived: Two  # time at rest, in motion, s
+    regime_seconds: Two  # time at rest, in motion, s
     # (rad/s)^2, square of the fastest rate since which the noise in motion is known
-    met: Real
+    largest_speed_squared: Real
     seen: Four  # values of each time scale so far
     quick: Channels  # variance over the last half second, over the learned one
     unknown: Channels  # by how much the variance of long times may still be larger
@@ -417,9 +417,9 @@ def update_long_noise(
 @compiled
 def update_largest_rate(noise: Noise, square: float) -> None:
     """Begin to learn the slow noise of motion anew where the square of the rate is far beyond any before."""
-    if noise.regime == MOTION and square > FASTER * noise.met:
-        noise.met = square
-        noise.lived[MOTION] = 0.0
+    if noise.regime == MOTION and square > FASTER * noise.largest_speed_squared:
+        noise.largest_speed_squared = square
+        noise.regime_seconds[MOTION] = 0.0
 
 
 @compiled
@@ -436,10 +436,10 @@ def follow_loudness(noise: Noise, n: int, louder: float, seconds: float) -> None
 @compiled
 def update_unknown(noise: Noise, n: int, seconds: float) -> None:
     """Update how much larger slow noise may still be: unknown at first, and for longer where noise is coloured."""
-    noise.lived[noise.regime] += seconds
-    lived = noise.lived[noise.regime]
+    noise.regime_seconds[noise.regime] += seconds
+    seconds_in_regime = noise.regime_seconds[noise.regime]
     for i in range(n):
-        known = min(lived, noise.since[i])
+        known = min(seconds_in_regime, noise.since[i])
         noise.unknown[i] = 1.0 + UNKNOWN / (
             1.0 + 0.25 * known * known / noise.longest[i]
         )

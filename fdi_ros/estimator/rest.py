@@ -87,7 +87,7 @@ def update_rest(params: Constants, kf: Estimator) -> None:
         kf.rest_bias_variance,
         params.rest_std * params.rest_std,
     )
-    if kf.noise.lived[REST] > LONG_TIME:
+    if kf.noise.regime_seconds[REST] > LONG_TIME:
         # A hover may turn as slowly, but has more noise.
         for i in range(n):
             if (

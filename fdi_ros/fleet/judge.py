@@ -139,7 +139,7 @@ def _is_recording(path: Path, unread: list[str]) -> bool:
 
 DEFAULT_SYSTEM = 1
 """Default MAVLink system of an autopilot."""
-CALIBRATED = 1_000_000
+MOST_CALIBRATION_SAMPLES = 1_000_000
 """Largest number of samples of a calibration, the first ones of a long flight."""
 
 
@@ -306,7 +306,8 @@ def _calibrated(path: Path, parameters: str) -> str:
     given = parameters_of(parameters)
     config = Config.from_parameters(given)
     result = calibrate(
-        read_block(path, config, end=CALIBRATED / config.sample_rate), config
+        read_block(path, config, end=MOST_CALIBRATION_SAMPLES / config.sample_rate),
+        config,
     )
     kept = {name: value for name, value in given.items() if name not in REPLACED}
     return parameter_file(

@@ -269,7 +269,7 @@ def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
     if abs(channel.drift) > NEARLY * own > 0:
         limit = f"a fault beyond {own:g} ({section}.max_drift)"
         words.append(f"bias has drifted by {_figure(channel.drift)} {unit}, {limit}")
-    if status.is_far(channel):
+    if status.has_implausible_start_bias(channel):
         words.append(
             f"bias of {_figure(channel.start_bias)} rad/s at the start, far above bias.turn_on_std"
             f" ({bias.turn_on_std:g}): perhaps a fault from before the start"

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.messages import (
+    FROM_TRIANGLE,
     ChannelsTemplate,
     ImuTemplate,
     fill_force,
@@ -34,9 +35,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ChannelState", "Event", "Output", "Reason"]
 
-_FULL = np.array(
-    [0, 1, 2, 1, 3, 4, 2, 4, 5]
-)  # where the nine entries of a (3, 3) matrix are in its upper triangle
 _FLAG = np.dtype(np.bool_)
 
 
@@ -226,7 +224,7 @@ class Output:
     @property
     def covariance(self) -> Array:
         """(N, 3, 3) of the fused rate, (rad/s)^2, NaN where the sample has none."""
-        return np.asarray(self.rows["covariance"][:, _FULL].reshape(-1, 3, 3))
+        return np.asarray(self.rows["covariance"][:, FROM_TRIANGLE].reshape(-1, 3, 3))
 
     def __repr__(self) -> str:
         seconds = (int(self.stamp[-1]) - int(self.stamp[0])) / 1e9 if len(self) else 0.0

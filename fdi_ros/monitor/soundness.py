@@ -242,7 +242,7 @@ def live_word(status: Status, concerns: Sequence[Concern]) -> Word:
     """Return the first word of the verdict on a monitor at its last sample."""
     if any(map(is_declared, status.channels)):
         return Word.FAULTY
-    far = any(map(status.is_far, status.channels))
+    far = any(map(status.has_implausible_start_bias, status.channels))
     if not status.has_rate or not status.can_detect or far:
         return Word.CANNOT_TELL
     states = {channel.state for channel in status.channels}

@@ -228,7 +228,7 @@ class Status:
             acceleration=acceleration,
         )
 
-    def is_far(self, channel: ChannelStatus) -> bool:
+    def has_implausible_start_bias(self, channel: ChannelStatus) -> bool:
         """Whether a channel is used that began with a bias no healthy gyro is expected to have."""
         return (
             not channel.is_left_out

@@ -244,7 +244,11 @@ class Judge(Walk):
         end = self._end
         delays = zip(status.units, status.delays, status.delay_std, strict=False)
         levels = (status.protection_level, status.protection_level_after_loss)
-        far = [one.name for one in status.channels if status.is_far(one)]
+        far = [
+            one.name
+            for one in status.channels
+            if status.has_implausible_start_bias(one)
+        ]
         channels = tuple(self._channels(end, status.channels))
         monitor = MonitorResult(
             channels=channels,
