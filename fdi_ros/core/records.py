@@ -295,9 +295,8 @@ class Health:
     samples: Counts  # samples delivered
     stuck: Counts  # samples that repeated a value against the motion of the others
     noisy: Counts  # samples in which the channel was much noisier than the other units
-    usual_noise: (
-        Channels  # recent noise relative to noise_std, slow to follow increases
-    )
+    # recent noise relative to noise_std, slow to follow increases
+    usual_noise: Channels
     last_noisy: NoisySpell
     longest_noisy: NoisySpell
     gone: Channels  # share of non-finite values among the recent ones
@@ -420,9 +419,8 @@ class Subset:
     # protection level of each body axis if all errors have noise_std, rad/s
     level: Vector
     limit: Channels  # largest residual that then passes the separation test, rad/s
-    share: (
-        Axes  # row i: largest weight of channel i's variance in the level of each axis
-    )
+    # row i: largest weight of channel i's variance in the level of each axis
+    share: Axes
 
 
 @record
@@ -497,9 +495,8 @@ class Evidence:
     flickers: Mask  # channels whose values seem to come and go
     intermittent: Mask  # channels whose values certainly come and go
     repeats: Mask  # channels that have repeated one value for long
-    error: (
-        Channels  # channel less the rate of the channels in use, along its axis, rad/s
-    )
+    # channel less the rate of the channels in use, along its axis, rad/s
+    error: Channels
 
 
 @record

@@ -65,9 +65,8 @@ any mean, so with full odds no fault would ever be named."""
 GAIN_STD, DELAY_STD = 0.1, 0.03
 """Standard deviations for a unit that is wrong as a whole: of its gain (a wrong range), and
 of its delay in s (a clock that was set, by 40 ms for instance)."""
-LEAST_PRESENCE = (
-    0.9  # share of the samples that a channel must deliver before its mean counts
-)
+# share of the samples that a channel must deliver before its mean counts
+LEAST_PRESENCE = 0.9
 # log odds that each free amplitude costs: its size may lie anywhere in four decades
 SPREAD = 1.3
 # possible error of the model (axes, scale factors) as a share of the largest error
@@ -105,9 +104,8 @@ class Inference:
     louder: Channels  # variance of a sample since the onset beyond the learned one, (rad/s)^2
     moved: Real  # by which each bias may have moved since the onset, rad/s
     rate: Vector  # mean body rate, rad/s
-    angular_acceleration: (
-        Channels  # recent peak of the angular acceleration along each channel, rad/s^2
-    )
+    # recent peak of the angular acceleration along each channel, rad/s^2
+    angular_acceleration: Channels
     change: Vector  # change of the body rate over the mean, rad/s
     at: Projection  # projection of the error states in the motion of the mean
     parity: Parity

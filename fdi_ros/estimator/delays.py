@@ -8,13 +8,11 @@ from __future__ import annotations
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.estimator.estimator import Constants, Estimator
 
-LEAST_COMPENSATED_DELAY = (
-    0.002  # s. A smaller delay stays an error state: its first order is accurate enough
-)
+# s. A smaller delay stays an error state: its first order is accurate enough
+LEAST_COMPENSATED_DELAY = 0.002
 SURE = 25.0  # squared delay over its variance from which values are moved by the delay
-LONGEST_DELAY = (
-    0.06  # s that are made up for at most: what `RESTAMP_SAMPLES` hold at 16 kHz
-)
+# s that are made up for at most: what `RESTAMP_SAMPLES` hold at 16 kHz
+LONGEST_DELAY = 0.06
 
 
 @compiled

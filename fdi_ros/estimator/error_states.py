@@ -50,9 +50,8 @@ class StateKind(NamedTuple):
     # other
     prior: float
     walk: float = 0.0  # random walk, per sqrt(s), where none other is given
-    memory: float = (
-        0.0  # s, after which a rate of change has faded: a Gauss-Markov process
-    )
+    # s, after which a rate of change has faded: a Gauss-Markov process
+    memory: float = 0.0
     feeds: str = ""  # name of the kind whose rate of change this is
 
 

@@ -176,9 +176,8 @@ class Estimator:
     clean_rate: Vector  # of that, rad/s
     rate: Vector  # of the last sample, rad/s
     corrected: Channels  # values less their estimated errors, rad/s
-    imputed: (
-        Channels  # the same, with the rate of the others in place of a spike, rad/s
-    )
+    # the same, with the rate of the others in place of a spike, rad/s
+    imputed: Channels
     innovation: Channels  # corrected values less the rate along each channel, rad/s
     statistic: Channels  # (A y)_i of the last sample over its standard deviation in this motion
     distance: Channels  # ``|A y|_i / sqrt(A_ii)`` of the last sample
@@ -229,9 +228,8 @@ class Estimator:
     matrix: Annotated[
         NDArray[np.float64], "f8", (MAX_CHANNELS, MAX_CHANNELS)
     ]  # M of a block, or of a sample, (rad/s)^2
-    block_information: (
-        Square  # A of all its channels, whatever is learned from, s^2/rad^2
-    )
+    # A of all its channels, whatever is learned from, s^2/rad^2
+    block_information: Square
     block_noise: Channels  # variance of the mean of a block by noise, (rad/s)^2
     block_innovation: Channels  # rad/s
     block_values: Channels  # A y, s/rad
@@ -262,9 +260,8 @@ class Estimator:
     rest_count: Whole  # blocks in `rest_rates`
     rest: Flag
     unseen: Flag  # nothing is known yet of the motion since a hole
-    hole_at: (
-        Real  # when the first of the last holes in the stream began, s since the start
-    )
+    # when the first of the last holes in the stream began, s since the start
+    hole_at: Real
     hole_sample: Whole  # number of the last sample before the hole; 0: no hole
     used_at: Real  # of the last sample that was used, s since the start
     held: Real  # s that the states have been held

@@ -70,9 +70,8 @@ TAIL_FIRST = TAIL_MEMORY / 3.0
 the first guess."""
 # standard deviation of products of squares two samples apart in white noise, cut at `FAR`
 TAIL_SCATTER = 2.8
-LEARNED_IN = (
-    64.0  # samples per degree of freedom: `TRUST` is reached in half a minute at 100 Hz
-)
+# samples per degree of freedom: `TRUST` is reached in half a minute at 100 Hz
+LEARNED_IN = 64.0
 
 ByScale = Annotated[NDArray[np.float64], "f8", (SCALES, MAX_CHANNELS)]
 ByLevel = Annotated[NDArray[np.float64], "f8", (SCALES + LAGS, MAX_CHANNELS)]
@@ -149,9 +148,8 @@ class SharedNoise:
     line: Square  # of R what lines explained while nothing was suspicious, (rad/s)^2
     product: Square  # A R
     excess: Real  # level of R over independent channels, at least 1
-    coherent: (
-        Real  # share of the noise that lines explain, and independent channels do not
-    )
+    # share of the noise that lines explain, and independent channels do not
+    coherent: Real
     level: Channels  # variance of each channel now, (rad/s)^2
     checked: Pair  # mean of `level` at rest, in motion, while checked, (rad/s)^2
     checked_blocks: Two  # blocks that these are means of

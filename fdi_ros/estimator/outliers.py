@@ -28,15 +28,13 @@ from fdi_ros.model.samples import Array
 
 OUTLIER = 5.5  # standard deviations, reached by normal noise in one of 2e7 values
 ALIKE = 0.95  # share of the largest distance from which a channel is also a candidate
-SPIKE_SAMPLES = (
-    4  # longest spike: re-stamping spreads a single value over its neighbours
-)
+# longest spike: re-stamping spreads a single value over its neighbours
+SPIKE_SAMPLES = 4
 MISFIT = 1e-4
 """Share of the chi-square that a true hypothesis may leave: 1 % of the spike shows in other
 channels, because their scale errors were corrected at a rate that contains the spike."""
-CLOSER = (
-    0.25  # ratio of squared changes of the rate below which the smaller one decides
-)
+# ratio of squared changes of the rate below which the smaller one decides
+CLOSER = 0.25
 
 
 @compiled

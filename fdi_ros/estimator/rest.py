@@ -15,9 +15,8 @@ from fdi_ros.estimator.noise import REST, THREE_SIGMA
 from fdi_ros.model.samples import Array
 
 QUIET = 3.0  # largest block variance over earlier rest: a hover in vibration has more
-REST_STD = (
-    3e-4  # rad/s, of the rate at rest: rotation of the earth, vibration of a table
-)
+# rad/s, of the rate at rest: rotation of the earth, vibration of a table
+REST_STD = 3e-4
 UNLEARNED = 0.003  # rad/s, largest bias uncertainty in the test: a larger mean rate may be a turn
 # largest scatter of one second of blocks over noise: exceeded once in 1000 (72 degrees
 # of freedom)

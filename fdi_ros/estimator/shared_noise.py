@@ -52,9 +52,8 @@ STEADY = 4.0
 may shift variance between parallel channels. In stronger motion a channel that sees a
 tenth more of it would look noisier. At this limit its variance is wrong by a sixth."""
 UNEQUAL = 0.15  # relative difference of the units' response to vibration: logs show 0.04 to 0.6
-INDEPENDENT = (
-    4.0  # values of a block that are independent of one another: all four at 100 Hz
-)
+# values of a block that are independent of one another: all four at 100 Hz
+INDEPENDENT = 4.0
 # Blocks, 10 s, over which the level of checked channels is averaged.
 MOST_CHECKED = 250.0
 # Share of Q, and of 1e-11 (rad/s)^2, added to the diagonal of Q so that Q has an

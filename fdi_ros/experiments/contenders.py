@@ -94,9 +94,8 @@ def _products(z: Array, forms: Array) -> Array:
 
 BOUND = 3.0
 """Guaranteed bound of a channel in a study, in noise_std: 3 sigma taken for a limit."""
-LOOSE_BOUNDS = (
-    0.2  # loose threshold of `guaranteed`, in bounds, from which its own is found
-)
+# loose threshold of `guaranteed`, in bounds, from which its own is found
+LOOSE_BOUNDS = 0.2
 RANKED_BY_SCORE = ("likelihood_ratio", "cusum")
 """Methods that rank suspects by scores. Others rank by the largest normalised error."""
 

@@ -117,9 +117,8 @@ class GyroErrors:
 
     noise_std: float = 0.0025  # white noise of one sample, rad/s
     bias_std: float = 0.01  # bias at switch-on, rad/s
-    bias_walk: float = (
-        2e-5  # random walk of the bias, rad/s per square root of a second
-    )
+    # random walk of the bias, rad/s per square root of a second
+    bias_walk: float = 2e-5
     scale_std: float = 0.001  # scale factor, dimensionless
     misalignment_std: float = 0.001  # angle between true and nominal axis, rad, in each of the two directions across it
     delay_std: float = 0.0002  # sampling instant of a chip against the stamp, s

@@ -31,9 +31,8 @@ from fdi_ros.replay.outcomes import Z95, Estimate, mean_of, quantiles, share
 
 FOUND, DERIVED = "found", "derived"
 """Thresholds: found on healthy channels, or derived by each method from the rate."""
-FALSE_ALARM_MARGIN = (
-    4.0  # the loose thresholds have this many times the false-alarm rate asked for
-)
+# the loose thresholds have this many times the false-alarm rate asked for
+FALSE_ALARM_MARGIN = 4.0
 
 
 class Snapshot(CommonRate):

@@ -46,9 +46,8 @@ class ImuMessage(NamedTuple):
     name: str
     number: int
     kind: str  #: Messages of one kind bring several units of one sort.
-    size: (
-        int  #: Bytes of the payload with extensions. MAVLink 2 drops zeros at the end.
-    )
+    #: Bytes of the payload with extensions. MAVLink 2 drops zeros at the end.
+    size: int
     head: struct.Struct  #: First fields: time, acceleration and rate, three each.
     microseconds: int  #: Microseconds in one unit of time.
     gyro: float  #: rad/s in one unit of rate.
@@ -273,9 +272,8 @@ class Streams:
 
 
 DRIFT = 1e-4  #: Largest drift between two clocks.
-SLEW = (
-    1e-3  #: Rate at which the offset in use follows a better one. Stamps do not step.
-)
+#: Rate at which the offset in use follows a better one. Stamps do not step.
+SLEW = 1e-3
 STEP = 20 * MS  #: A better offset further away is taken at once, ns.
 GRAIN = MS  #: Largest step of the times in answers, ns.
 LONGEST = NS  #: Longer round trips are ignored, ns.

@@ -189,9 +189,8 @@ EVERY = NS  #: Mean time between texts, ns.
 AT_ONCE = 5  #: Texts that may follow each other at once after a quiet time.
 SETTLE = NS // 5  #: Changes within this time share texts, ns.
 SILENT = 3 * NS  #: A monitor without reports for this time is silent, ns.
-STANDING = (
-    2 * NS
-)  #: `NOTHING_SEEN` is announced after this time, ns: a late unit ends sooner.
+#: `NOTHING_SEEN` is announced after this time, ns: a late unit ends sooner.
+STANDING = 2 * NS
 GRAVE = 0.03  #: ArduCopter flies with a smaller error of a gyro, rad/s.
 #: Raw rates of healthy gyros, in whole mrad/s and averaged, differ by less, rad/s.
 ROUNDED = 0.005

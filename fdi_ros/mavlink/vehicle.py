@@ -58,9 +58,8 @@ STAND_IN = 2 * NS  #: After this time without SCALED_IMU, RAW_IMU replaces it, n
 WINDOW = 2 * NS  #: Rates are measured over this time, ns.
 MOST_LATE = 8  #: After this number of late messages in a row the count begins anew.
 _PEERS = 8  # largest number of addresses with a parser
-_LEFT = (
-    1 << 12
-)  # bytes after which a parser's buffer is cut: pymavlink cuts an empty one only
+# bytes after which a parser's buffer is cut: pymavlink cuts an empty one only
+_LEFT = 1 << 12
 LARGEST = 3.4e38  #: Largest float in a message.
 
 

@@ -32,12 +32,10 @@ UNIT_DELAY, CHANNEL_DELAY = 0.015, 0.001
 """Prior standard deviation of the delay between two units, s: for units with stamps of
 their own, and for channels that arrive in one message."""
 BOUND_IN_NOISE = 4.0  # default guaranteed bound, in noise_std. White noise exceeds the bound in 6e-5 of samples
-REST_NOISE = (
-    4.0  # at rest the standard deviation of a channel is at most this many noise_std
-)
-RETURN_PROBABILITY = (
-    1e-6  # chance that a healthy channel disagrees in one sample while returning
-)
+# at rest the standard deviation of a channel is at most this many noise_std
+REST_NOISE = 4.0
+# chance that a healthy channel disagrees in one sample while returning
+RETURN_PROBABILITY = 1e-6
 
 
 def build_geometry(config: Config) -> Geometry:

@@ -55,9 +55,8 @@ class _Modes(NamedTuple):
     sigma: Array  # (h, 3) standard deviation of the rate without them, rad/s
     sigma_share: Array  # (h, 3, k) share of its square that is due to each channel
     limit: Array  # (h, 3) largest separation that passes the test, rad/s, inf where the rest gives no rate
-    limit_share: (
-        Array  # (h, 3, k) part of that which is due to each channel's variance, rad/s
-    )
+    # (h, 3, k) part of that which is due to each channel's variance, rad/s
+    limit_share: Array
 
 
 class Integrity:

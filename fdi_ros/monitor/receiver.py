@@ -42,9 +42,8 @@ from fdi_ros.monitor.pipeline import Pipeline
 
 STANDING_TIME = 2_000_000_000  # ns of steady time. A simulation at a tenth of real time steps by 0.2 s
 RATE_TOLERANCE = 0.1  # relative difference to the configured rate that is reported
-RATE_WINDOWS = (
-    4  # consecutive measurements that must agree: a pause or a loss is no rate
-)
+# consecutive measurements that must agree: a pause or a loss is no rate
+RATE_WINDOWS = 4
 
 
 class SilenceClock:

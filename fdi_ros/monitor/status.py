@@ -36,9 +36,8 @@ from fdi_ros.model.samples import Array, Mask
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.system.text import plus_minus
 
-CERTAIN = (
-    4.0  # standard deviations from which two channels of a larger set surely differ
-)
+# standard deviations from which two channels of a larger set surely differ
+CERTAIN = 4.0
 LOST = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
 UNUSUAL = 3.0  # expected standard deviations from which an error is unusual
 
@@ -52,9 +51,8 @@ class NoisySpell:
     since: int  #: Stamp of its first sample, ns.
     until: int  #: Stamp of its last sample so far, ns.
     samples: int  #: Number of noisy samples.
-    times: (
-        float  #: Their mean noise over the expected or usual one, whichever is smaller.
-    )
+    #: Their mean noise over the expected or usual one, whichever is smaller.
+    times: float
 
     @property
     def seconds(self) -> float:

@@ -173,9 +173,8 @@ class Baseline:
     judgement: Judgement
     judged: float
     """Share of judged samples."""
-    doubtful: (
-        Mask  # (N,) a channel stands declared, by itself or in a set, or gives nothing
-    )
+    # (N,) a channel stands declared, by itself or in a set, or gives nothing
+    doubtful: Mask
     speed: Array
     """(N,) norm of the fused rate, rad/s. NaN: no rate."""
     begins: float

@@ -62,15 +62,13 @@ NAMES = (
     "imu_3",
 )  #: Names of units where the settings name none, on topics ``NAME/data_raw``.
 WAIT = 0.02  #: Longest wait for the link between two turns of the executor, s.
-INJECTED = (
-    "_faulty"  #: Suffix of topics of the injector, the monitor's inputs on a bench.
-)
+#: Suffix of topics of the injector, the monitor's inputs on a bench.
+INJECTED = "_faulty"
 PARTING = 4.0  #: Longest wait at the end, on the ground, until IMUs are put back, s.
 MOST_CALLS = 32  #: Largest number of callbacks in a turn of the executor.
 _SEND_EVERY = 10_000_000  # interval at which due messages are sent, ns
-_LARGEST = (
-    1 << 17
-)  # largest diagnostics that are read, bytes; twelve channels take 10 000
+# largest diagnostics that are read, bytes; twelve channels take 10 000
+_LARGEST = 1 << 17
 _VALUE_EVERY = 450_000_000  # interval between two NAMED_VALUE_FLOAT of one name, ns
 
 

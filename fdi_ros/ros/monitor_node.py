@@ -39,9 +39,8 @@ from fdi_ros.system.text import shown
 
 CHECK_PERIOD = 0.05  # period of the checks for silence and of saving a changed state, s
 LATE = 2  # periods after which the timer is not waited for any longer: the executor's queue is full
-END_OF_TIME = (
-    2**62
-)  # stamps beyond all clocks, ns: a clock was set back by decades again and again
+# stamps beyond all clocks, ns: a clock was set back by decades again and again
+END_OF_TIME = 2**62
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 RCLError = rclpy_implementation.RCLError
 

@@ -51,9 +51,8 @@ REPORT_PERIOD = 1.0  # from one regular report of a node to the next, s
 MOST_LINES = 20
 LONGEST = 0.05  # longest turn, s: reports and requests do not wait for a flood
 FLOOD = 5000  # events that may wait in the queue of an executor: some 50 ms of its work, 1 MB
-FLOOD_TIME = (
-    5.0  # time after the start of a flood before the first check for its end, s
-)
+# time after the start of a flood before the first check for its end, s
+FLOOD_TIME = 5.0
 SETTABLE = range(ParameterType.PARAMETER_BOOL, ParameterType.PARAMETER_STRING_ARRAY + 1)
 """Types that a parameter can be set to.
 
