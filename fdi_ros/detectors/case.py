@@ -410,7 +410,10 @@ def widen(params: Constants, state: State) -> None:
     inference.common = 0
     for unit in range(params.units):
         inside = params.members[unit] & inference.mask
-        holds = named & ~inside == 0 and named != inside and inside != inference.mask
+        if named == inside:
+            # A whole unit is not named, but the set that the odds give stays.
+            return
+        holds = named & ~inside == 0 and inside != inference.mask
         if holds and not shows_others(params, state, inside):
             inference.union = inside
             return
