@@ -258,6 +258,11 @@ def test_an_oscillation_is_no_clear_error() -> None:
     assert not watched.blamed(8.0)
 
 
+def late_by(watched: Watched, delay: float) -> Gyro:
+    """Return a gyro that measures this much earlier than its stamp, s."""
+    return lambda rate: watched.rate(watched.t - delay)
+
+
 @pytest.mark.parametrize("delay", [0.005, 0.02])
 def test_an_imu_that_measures_later_is_not_blamed_in_hard_manoeuvres(
     delay: float,
@@ -265,8 +270,7 @@ def test_an_imu_that_measures_later_is_not_blamed_in_hard_manoeuvres(
     """Up to 60 rad/s^2: 1.2 rad/s within 20 ms."""
     watched = Watched()
     watched.rate = lambda t: np.array([6.0 * math.sin(10.0 * t), 0.0, 0.0])
-    late = lambda rate: watched.rate((watched.now - START) / NS - delay)  # noqa: E731
-    watched.gyros[2] = late
+    watched.gyros[2] = late_by(watched, delay)
     watched.states[6:] = [SUSPECT] * 3
     assert not watched.blamed(10.0)
 
@@ -371,8 +375,8 @@ def test_a_pause_of_the_messages_makes_no_error_of_a_vibration(
         assert not watched.blamed(0.4)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
-def test_an_error_over_a_link_that_loses_messages_is_blamed(share: float) -> None:
+def over_a_lossy_link(share: float) -> Watched:
+    """Return IMUs of whose messages a link loses a share."""
     watched = Watched(interval=NINE, loop=400.0)
     lost = np.random.default_rng(3)
     feed = watched.evidence.raw.feed
@@ -382,7 +386,18 @@ def test_an_error_over_a_link_that_loses_messages_is_blamed(share: float) -> Non
             feed(unit, stamp, rate)
 
     watched.evidence.raw.feed = lossy  # type: ignore[method-assign]
-    watched.run(1.0)
+    return watched
+
+
+def test_a_difference_stays_known_over_a_link_that_loses_messages() -> None:
+    watched = over_a_lossy_link(0.4)
+    for _ in range(4000):
+        assert not any(math.isnan(imu.size) for imu in watched.step())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
+def test_an_error_over_a_link_that_loses_messages_is_blamed(share: float) -> None:
+    watched = over_a_lossy_link(share).run(1.0)
     watched.states[6] = FAULTY
     watched.gyros[2] = biased(0.3)
     assert watched.blamed(0.25 if share < 0.3 else 0.5) == {2}
@@ -518,3 +533,44 @@ def test_samples_form_a_pair_within_four_tenths_of_an_interval(
     found = raw.between(0, 1, START + 400 * MS)
     assert (found is not None) == compared
     assert not compared or found.mean == pytest.approx((0.1, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("stands", "blamed"), [(0.2, set()), (0.6, {2})])
+def test_a_doubt_of_two_is_refuted_once_they_have_agreed_for_a_time(
+    stands: float, blamed: set[int]
+) -> None:
+    """The monitor may see a common fault of two before their raw rates show the fault."""
+    watched = Watched()
+    watched.states[:6] = [AMBIGUOUS, OK, OK] * 2
+    watched.run(stands)
+    watched.gyros[2] = biased(-0.7)
+    assert watched.blamed(0.5) == blamed
+
+
+def shaking_late() -> Watched:
+    """Return IMUs in a vehicle that shakes, the first of which measures 2.5 ms later."""
+    watched = Watched(interval=NINE, loop=400.0)
+    watched.rate = lambda t: np.array([1.2 * math.sin(75.0 * t), 0.0, 0.0])
+    watched.gyros[0] = late_by(watched, 0.0025)
+    return watched
+
+
+def test_imus_that_differ_by_a_delay_alone_outvote_the_third() -> None:
+    watched = shaking_late().run(1.0)
+    watched.states = [AMBIGUOUS, OK, OK] * 3
+    watched.gyros[2] = biased(-0.2)
+    assert watched.blamed(1.0) == {2}
+
+
+def test_an_imu_that_has_healed_is_trusted_again_while_the_vehicle_shakes() -> None:
+    watched = shaking_late()
+    watched.gyros[0] = biased(0.5)
+    watched.states[0] = FAULTY
+    assert watched.blamed(1.0) == {0}
+    watched.gyros[0] = late_by(watched, 0.0025)
+    watched.run(1.5)
+    watched.states[0] = OK
+    watched.run(1.5)
+    watched.states = [AMBIGUOUS, OK, OK] * 3
+    watched.gyros[2] = biased(-0.2)
+    assert watched.blamed(1.0) == {2}
