@@ -44,17 +44,24 @@ Motion = Callable[[float], np.ndarray]
 """Rates of all IMUs, (units, 3) rad/s in FRD, at a time since the start of the simulation, s."""
 
 
-def gentle(units: int, seed: int = 0, noise: float = 0.002) -> Motion:
-    """A vehicle in gentle motion."""
-    random = np.random.default_rng(seed)
+@dataclass
+class Gentle:
+    """Gentle motion of a vehicle, and white noise of its IMUs."""
 
-    def rates(t: float) -> np.ndarray:
+    units: int
+    noise: float
+    random: np.random.Generator
+
+    def __call__(self, t: float) -> np.ndarray:
         omega = np.array(
             [0.5 * math.sin(0.8 * t), 0.4 * math.cos(1.1 * t), 0.3 * math.sin(0.5 * t)]
         )
-        return omega + random.normal(0.0, noise, (units, 3))
+        return omega + self.random.normal(0.0, self.noise, (self.units, 3))
 
-    return rates
+
+def gentle(units: int, seed: int = 0, noise: float = 0.002) -> Gentle:
+    """Return the motion of a vehicle in gentle motion, with noise by a seed, rad/s."""
+    return Gentle(units, noise, np.random.default_rng(seed))
 
 
 def milli(value: float) -> int:
@@ -174,10 +181,11 @@ class Autopilot:
 
     def _step(self, now: int) -> list[bytes]:
         out: list[bytes] = []
-        for at, name, value in self._answers:
-            if at <= now:
-                self._send_value(name, value, out)
-        self._answers = [one for one in self._answers if one[0] > now]
+        if self._answers:
+            for at, name, value in self._answers:
+                if at <= now:
+                    self._send_value(name, value, out)
+            self._answers = [one for one in self._answers if one[0] > now]
         if now - self._beat >= NS:
             self._beat = now
             kind = (
@@ -194,11 +202,11 @@ class Autopilot:
             self._asked = now
             self._send(self.mav.timesync_encode(0, self.clock(now) * 1000), out)
         for number, interval in list(self.intervals.items()):
-            # ArduPilot sends all messages of an interval together, PX4 each from when it was asked for.
-            step = interval * 1000 if self.stack != "px4" else 1
-            due = self.due.setdefault(
-                number, -((self.boot - now) // step) * step + self.boot
-            )
+            due = self.due.get(number)
+            if due is None:
+                # ArduPilot sends all messages of an interval together, PX4 each from when it was asked for.
+                step = interval * 1000 if self.stack != "px4" else 1
+                due = self.due[number] = -((self.boot - now) // step) * step + self.boot
             if now >= due:
                 # After a pause too, messages of one interval have the same times.
                 passed = max(1, (now - due) // (interval * 1000))
@@ -417,13 +425,17 @@ class Conversation:
         self.sent: Counter[str] = Counter()
         self.sent_to: Counter[Any] = Counter()
         settings = VehicleSettings(**{"rate": 50.0, "kind": "SCALED_IMU", **settings})
-        self.vehicle = Vehicle(settings, self._send, lambda: UTC + self.now / NS)
+        self.vehicle = Vehicle(settings, self._send, self.unix)
         self.samples: list[tuple[int, ImuSample]] = []
         """With the time at which each came out, ns."""
         self.cut = False
         self._order = count()
         self._under_way: list[tuple[int, int, int, Any, bytes]] = []
         self._check = mavlink.MAVLink(None)
+
+    def unix(self) -> float:
+        """Unix time of the simulation, s."""
+        return UTC + self.now / NS
 
     def _send(self, data: bytes, peer: Any) -> None:
         message = self._check.parse_char(data)

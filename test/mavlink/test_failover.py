@@ -3,12 +3,16 @@
 
 """Failover: never a healthy IMU, never the last, never worse than none; and its conversation with an autopilot."""
 
+import copy
+import copyreg
 import json
+import struct
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -16,6 +20,7 @@ import pytest
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink import failover_file
 from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
+from fdi_ros.mavlink.failover_file import FailoverFile
 from fdi_ros.mavlink.failover_policy import Condition, PolicySettings
 from fdi_ros.mavlink.failover_words import WORDS, imu_name, imu_text
 from fdi_ros.system.clocks import Clocks
@@ -66,14 +71,29 @@ class Monitored(Conversation):
         super().__init__(*autopilots, may_set=True, rate=rate, **settings)
         policy = PolicySettings(limit, min_size)
         self.failover = Failover(
-            self.vehicle, CHANNELS, policy, path / "out.json", lambda: self.clocks()
+            self.vehicle, CHANNELS, policy, path / "out.json", self.read_clocks
         )
-        #: Clocks of the companion.
-        self.clocks = lambda: Clocks(UTC + self.now / NS)
+        #: Clocks of the companion. None: Unix time alone.
+        self.clocks: Callable[[], Clocks] | None = None
         self.states = [OK] * 9
         self.failover.is_alone = self.reports = True
         self.failover.age = 0.02
         self._fed = 0
+
+    def read_clocks(self) -> Clocks:
+        return self.clocks() if self.clocks else Clocks(self.unix())
+
+    def copy(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> "Monitored":
+        """Return the same flight at the same time, with a file of its own."""
+        lock = type(self.autopilots[0]._lock)
+        with monkeypatch.context() as patch:
+            for kind in (struct.Struct, ModuleType):
+                patch.setitem(copyreg.dispatch_table, kind, lambda _: "itself")
+            patch.setitem(copyreg.dispatch_table, lock, lambda _: (threading.Lock, ()))
+            file = FailoverFile(path / "out.json", 3)
+            samples = list(self.samples)
+            known = {id(self.failover._file): file, id(self.samples): samples}
+            return copy.deepcopy(self, known)
 
     def run(self, seconds: float) -> "Monitored":
         for _ in range(round(seconds * 50)):
@@ -136,12 +156,19 @@ def until(talk: Monitored, condition: Callable[[], bool]) -> bool:
     return condition()
 
 
-@pytest.fixture
-def flying(tmp_path: Path) -> Monitored:
+@pytest.fixture(scope="module")
+def flight_of_13_s(tmp_path_factory: pytest.TempPathFactory) -> Monitored:
     autopilot = Autopilot("ardupilot", late_reads=80 * MS)
-    talk = Monitored(tmp_path, autopilot).run(10.0)
+    talk = Monitored(tmp_path_factory.mktemp("flight"), autopilot).run(10.0)
     autopilot.armed = True
     return talk.run(3.0)
+
+
+@pytest.fixture
+def flying(
+    flight_of_13_s: Monitored, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Monitored:
+    return flight_of_13_s.copy(tmp_path, monkeypatch)
 
 
 # What it does in flight ----------------------------------------------------------------
@@ -210,18 +237,16 @@ def test_with_a_limit_a_worse_imu_is_announced_and_stays(tmp_path: Path) -> None
 
 
 def test_over_a_lossy_link_an_imu_that_is_named_for_ever_is_a_witness(
-    tmp_path: Path,
+    flying: Monitored,
 ) -> None:
     """IMU 3 has healed, but stays declared: the next fault is in a set of IMU 1 and 2."""
-    autopilot = Autopilot("ardupilot", loss=0.2)
-    talk = Monitored(tmp_path, autopilot).run(10.0)
-    autopilot.armed = True
-    talk.run(3.0)
-    talk.fault(3, 0.3, seconds=4.0)
-    talk.fault(3, 0.0, seconds=7.0)
-    talk.states[:6] = [OK, AMBIGUOUS, OK] * 2
-    talk.fault(1, 0.2, [OK, AMBIGUOUS, OK], seconds=3.0)
-    assert talk.in_use == [False, True, True]
+    flying.autopilots[0].late_reads = 0
+    flying.autopilots[0].loss = 0.2
+    flying.fault(3, 0.3, seconds=4.0)
+    flying.fault(3, 0.0, seconds=7.0)
+    flying.states[:6] = [OK, AMBIGUOUS, OK] * 2
+    flying.fault(1, 0.2, [OK, AMBIGUOUS, OK], seconds=3.0)
+    assert flying.in_use == [False, True, True]
 
 
 @pytest.mark.parametrize("frequency", [49.8, 99.7])
@@ -229,10 +254,10 @@ def test_a_pause_of_the_link_makes_no_error_of_vibration(
     tmp_path: Path, frequency: float
 ) -> None:
     """After it the first samples alone do not show an oscillation."""
-    autopilot = Autopilot("ardupilot", motion=shaken((3,), frequency, 0.3))
+    autopilot = Autopilot("ardupilot")
     talk = Monitored(tmp_path, autopilot).run(10.0)
     autopilot.armed = True
-    talk.run(12.0)
+    shake(talk.run(10.0), (3,), frequency, 0.3)
     talk.states[6:] = [FAULTY, OK, OK]
     for _ in range(6):
         talk.cut = True
@@ -331,17 +356,27 @@ def test_no_fault_is_not_said_of_an_imu_that_differs(flying: Monitored) -> None:
     assert "IMU 2 in use, differs no more" in flying.texts
 
 
-def shaken(imus: Sequence[int], frequency: float, amplitude: float) -> Motion:
-    """Return gentle motion of three IMUs, of which some vibrate about x, from 10 s on."""
-    still = gentle(3)
+def shaken(
+    still: Motion, imus: Sequence[int], frequency: float, amplitude: float
+) -> Motion:
+    """Return a motion in which some IMUs also vibrate about x."""
 
     def rates(t: float) -> np.ndarray:
         found = still(t)
         phase = 2.0 * np.pi * frequency * t
-        found[[k - 1 for k in imus], 0] += amplitude * np.sin(phase) * (t > 30.0)
+        found[[k - 1 for k in imus], 0] += amplitude * np.sin(phase)
         return found
 
     return rates
+
+
+def shake(
+    talk: Monitored, imus: Sequence[int], frequency: float, amplitude: float
+) -> None:
+    """Let some IMUs vibrate, and fly on for 2 s."""
+    autopilot = talk.autopilots[0]
+    autopilot.motion = shaken(autopilot.motion, imus, frequency, amplitude)
+    talk.run(2.0)
 
 
 @pytest.mark.parametrize(
@@ -355,25 +390,22 @@ def shaken(imus: Sequence[int], frequency: float, amplitude: float) -> Motion:
     ],
 )
 def test_vibration_near_a_multiple_of_50_hz_is_no_error(
-    tmp_path: Path, frequency: float, amplitude: float, imus: Sequence[int]
+    flying: Monitored, frequency: float, amplitude: float, imus: Sequence[int]
 ) -> None:
     """Each 20 ms it would be a slow error, and the monitor names IMU 3 for it."""
-    autopilot = Autopilot("ardupilot", motion=shaken(imus, frequency, amplitude))
-    talk = Monitored(tmp_path, autopilot).run(10.0)
-    autopilot.armed = True
-    talk.run(12.0)
-    assert reason(talk) == "ready"
-    talk.states[6:] = [FAULTY, OK, OK]
-    talk.run(6.0)
-    assert not autopilot.sets
-    assert not any("out of use" in text or "differs" in text for text in talk.texts)
+    shake(flying, imus, frequency, amplitude)
+    assert reason(flying) == "ready"
+    flying.states[6:] = [FAULTY, OK, OK]
+    flying.run(6.0)
+    assert not flying.autopilots[0].sets
+    assert not any("out of use" in text or "differs" in text for text in flying.texts)
 
 
 def test_imus_that_come_at_50_hz_are_not_ready_and_bring_no_order(
     tmp_path: Path,
 ) -> None:
     """Over a slow line, or another station asks for another rate."""
-    motion = shaken((3,), 49.8, 0.1)
+    motion = shaken(gentle(3), (3,), 49.8, 0.1)
     autopilot = Autopilot("ardupilot", refuses={26, 116, 129}, motion=motion)
     autopilot.intervals = dict.fromkeys((26, 116, 129), 20_000)
     talk = Monitored(tmp_path, autopilot).run(15.0)
@@ -554,17 +586,14 @@ def test_a_danger_that_cannot_be_answered_is_repeated(flying: Monitored) -> None
     assert {text for severity, text in autopilot.texts if severity < 4}
 
 
-def test_an_order_that_was_lost_is_an_imu_in_use(tmp_path: Path) -> None:
+def test_an_order_that_was_lost_is_an_imu_in_use(flying: Monitored) -> None:
     """A set is lost for good, the autopilot reports "in use": the slot is free again."""
-    autopilot = Autopilot("ardupilot")
-    talk = Monitored(tmp_path, autopilot).run(10.0)
-    autopilot.armed = True
-    talk.run(3.0)
-    autopilot.read_only.add("INS_USE2")
-    talk.fault(2, 0.1, seconds=1.0)
-    talk.heal(2, 6.0)
-    talk.fault(1, 1.0, seconds=1.0)
-    assert talk.in_use == [False, True, True]
+    flying.autopilots[0].late_reads = 0
+    flying.autopilots[0].read_only.add("INS_USE2")
+    flying.fault(2, 0.1, seconds=1.0)
+    flying.heal(2, 6.0)
+    flying.fault(1, 1.0, seconds=1.0)
+    assert flying.in_use == [False, True, True]
 
 
 def test_an_answer_from_before_our_order_is_nobody_elses_hand(
