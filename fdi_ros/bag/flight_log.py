@@ -43,7 +43,7 @@ from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.system.files import EARLIEST, LATEST, LOG_SPAN
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import figures, shown
 
 IMU = "sensor_msgs/msg/Imu"
 SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
@@ -210,7 +210,7 @@ class Track:
             return "once"
         if self.last <= self.first:
             return "at times that do not advance"
-        return f"at {self.rate:.3g} Hz{' in bursts' if self.fast_enough and not self.steady else ''}"
+        return f"at {figures(self.rate)} Hz{' in bursts' if self.fast_enough and not self.steady else ''}"
 
 
 class FlightLog(BagFile):

@@ -30,6 +30,7 @@ from mcap.records import Channel, Schema, Statistics
 
 from fdi_ros.bag.raw import (
     NO_HORIZON,
+    PACKED,
     BagFile,
     Batch,
     Damage,
@@ -274,7 +275,7 @@ class McapFile(BagFile):
         """
         types = {one.name: one.type for one in self.topics}
         gyros = [source_of_type(types.get(name, "")) is not None for name in topics]
-        packed = starts_with(batch, zstandard.FRAME_HEADER)
+        packed = np.any([starts_with(batch, head) for head in PACKED], axis=0)
         packed &= np.array(gyros, dtype=bool)[batch.topic]
         if not packed.any():
             yield batch

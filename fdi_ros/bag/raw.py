@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
+import lz4.frame
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
@@ -100,15 +101,26 @@ def starts_with(batch: Batch, head: bytes) -> NDArray[np.bool_]:
     return found
 
 
+#: first bytes of a message that was compressed by itself, as zstd or LZ4; no plain message
+#: begins like that
+PACKED = (zstandard.FRAME_HEADER, b"\x04\x22\x4d\x18")
+
+
 def unpack_message(data: bytes, most: int) -> bytes:
-    """Unpack a message that is a zstd frame, to at most this many bytes.
+    """Unpack a message that is a zstd or LZ4 frame, to at most this many bytes.
 
     A damaged frame gives no bytes, which decoding counts as malformed.
     """
+    most = max(most, 0)
     try:
-        return zstandard.ZstdDecompressor().stream_reader(data).read(max(most, 0))
-    except (zstandard.ZstdError, MemoryError):
+        if data.startswith(zstandard.FRAME_HEADER):
+            return zstandard.ZstdDecompressor().stream_reader(data).read(most)
+        unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(
+            data, max_length=most
+        )
+    except (zstandard.ZstdError, RuntimeError, MemoryError):
         return b""
+    return unpacked
 
 
 @dataclass

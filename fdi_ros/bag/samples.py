@@ -23,6 +23,7 @@ from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.accelerometers import places, possible_units, varies
 from fdi_ros.monitor.building import build_geometry
+from fdi_ros.system.text import figures
 
 #: messages handed on together: enough that calls do not count, little enough for the
 #: cache
@@ -323,8 +324,8 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
     off = np.array([usual, mean]) / configured
     if (off > 1.0 + RATE_TOLERANCE).all() or (off < 1.0 - RATE_TOLERANCE).all():
         raise BagError(
-            f"{path}: sample_rate is {configured:g} Hz in the config and {usual:.4g} Hz in the recording: set"
-            f" sample_rate to {usual:.4g}"
+            f"{path}: sample_rate is {configured:g} Hz in the config and {figures(usual, 4)} Hz in the recording: set"
+            f" sample_rate to {figures(usual, 4)}"
         )
 
 

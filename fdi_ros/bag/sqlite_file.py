@@ -21,10 +21,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import zstandard
-
 from fdi_ros.bag.library_bag import LibraryBag, Message
-from fdi_ros.bag.raw import NO_HORIZON, Damage, Topic, unpack_message
+from fdi_ros.bag.raw import NO_HORIZON, PACKED, Damage, Topic, unpack_message
 from fdi_ros.errors import BagError
 from fdi_ros.system.files import (
     CHANNELS,
@@ -222,8 +220,6 @@ class SqliteFile(LibraryBag):
                 f"messages of none or more than {CHUNK_BYTES} bytes were left out"
             )
         # Each may be compressed by itself: no message begins like that.
-        if not isinstance(content, bytes) or not content.startswith(
-            zstandard.FRAME_HEADER
-        ):
+        if not isinstance(content, bytes) or not content.startswith(PACKED):
             return content
         return unpack_message(content, CHUNK_BYTES)

@@ -55,7 +55,7 @@ QUIET = 0.3
 #: Time without noise after which noise is a new spell, ns.
 NOISY_BREAK = 1_000_000_000
 #: Time constants with which the usual noise follows more and less noise, s.
-LOUDER_TIME, QUIETER_TIME = 120.0, 10.0
+LOUDER_TIME, QUIETER_TIME = 30.0, 10.0
 #: A value out of range is limited to this many ranges before the detector sees it.
 RAIL_LIMIT = 10.0
 WAITING = -1  #: Returned in place of a number of events.

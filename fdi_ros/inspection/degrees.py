@@ -21,7 +21,7 @@ from fdi_ros.inspection.topics import (
 from fdi_ros.inspection.turns import LEAST_ROTATION, SHARED
 from fdi_ros.model.samples import Array
 from fdi_ros.report.layout import DEGREES
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import figures, shown
 
 #: largest relative distance of a factor from that of a degree
 NEAR = 0.2
@@ -62,14 +62,14 @@ def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> 
         moving = (slow > LEAST_ROTATION) & np.isfinite(fast + slow)
         factors = fast[moving] / slow[moving]
         if moving.sum() > 1 and (np.abs(factors / DEGREES.factor - 1.0) < NEAR).all():
-            times = f"{float(np.median(factors)):.3g} times the rotation of {shown(slow_one.topic.name)}"
+            times = f"{figures(float(np.median(factors)))} times the rotation of {shown(slow_one.topic.name)}"
             return f"rad/s: {shown(fast_one.topic.name)} is in deg/s, it shows {times}"
     if chosen and all(_is_beyond(one, largest_rate) for one in chosen):
         largest = max(one.largest for one in chosen)
-        why = f"{largest:.3g} rad/s would be {largest / 2 / math.pi:.2g} turns a second"
+        why = f"{figures(largest)} rad/s would be {figures(largest / 2 / math.pi, 2)} turns a second"
     elif chosen and _no_gyros_at_rest(chosen):
         noise = max(float(one.segments.noise().quiet.max()) for one in chosen)
-        why = f"no gyro at rest has a bias and noise of {noise:.2g} rad/s"
+        why = f"no gyro at rest has a bias and noise of {figures(noise, 2)} rad/s"
     else:
         return ""
     names = " and ".join(shown(one.topic.name) for one in chosen)

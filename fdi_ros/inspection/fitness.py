@@ -31,7 +31,7 @@ from fdi_ros.model.noise import noisier_words
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
 from fdi_ros.report.layout import RADIANS, Unit
-from fdi_ros.system.text import first_of, shown
+from fdi_ros.system.text import figures, first_of, shown
 
 _OF_A_MONITOR = {
     topic.name.rpartition("/")[2]
@@ -94,7 +94,7 @@ def clocks_apart(reports: Sequence[TopicReport], beyond: float = 1.0) -> str:
         ]
     )
     words = [
-        f"{name} {abs(v):.6g} s {'ahead' if v > 0 else 'behind'}"
+        f"{name} {figures(abs(v), 6)} s {'ahead' if v > 0 else 'behind'}"
         for name, v in off
         if abs(v) > beyond
     ]
@@ -116,7 +116,7 @@ def no_common_time(reports: Sequence[TopicReport]) -> str:
     if not apart:
         return ""
     words = [
-        f"{shown(name)} from {(first - origin) * 1e-9:.6g} to {(last - origin) * 1e-9:.6g} s"
+        f"{shown(name)} from {figures((first - origin) * 1e-9, 6)} to {figures((last - origin) * 1e-9, 6)} s"
         for name, first, last in (spans[0], *apart)
     ]
     return (
@@ -133,7 +133,7 @@ def not_waited_for(reports: Sequence[TopicReport], timeout: float) -> str:
     first = reports[0]
     wait = max(timeout, LEAST_WAIT * max(one.interval for one in reports))
     words = [
-        f"{shown(one.topic.name)} {abs(one.ahead - first.ahead):.3g} s"
+        f"{shown(one.topic.name)} {figures(abs(one.ahead - first.ahead))} s"
         f" {'ahead' if one.ahead > first.ahead else 'behind'}"
         for one in reports
         if abs(one.ahead - first.ahead) > 1.1 * wait
@@ -142,7 +142,7 @@ def not_waited_for(reports: Sequence[TopicReport], timeout: float) -> str:
         return ""
     return (
         f"when messages arrive, stamps differ from those of {shown(first.topic.name)}:"
-        f" {', '.join(words)}; a unit is waited for {wait:.3g} s (imus.timeout)."
+        f" {', '.join(words)}; a unit is waited for {figures(wait)} s (imus.timeout)."
         " Synchronise the clocks, or raise imus.timeout if messages take so long"
     )
 
@@ -205,7 +205,7 @@ def _unusable(report: TopicReport) -> str:
         and not kind.stamped,
         f"all {received} messages are malformed, or have stamps before 1970": report.malformed
         == received,
-        f"no message in which all values are finite and below {BELIEVED:g} rad/s": not report.complete,
+        f"no message in which all values are finite and below {figures(BELIEVED)} rad/s": not report.complete,
         "a single message": received == 1,
         "its times of recording do not increase": not report.rate,
         f"it {report.copied}: {_NO_REDUNDANCY}": bool(report.copy_of),
@@ -271,7 +271,7 @@ def recording_findings(
     words = (
         f"{len(names)} channels in {f'{len(chosen)} units' if units else 'one array'}"
     )
-    words += f" at {max(one.rate for one in chosen):.3g} Hz"
+    words += f" at {figures(max(one.rate for one in chosen))} Hz"
     noise = np.concatenate([one.segments.noise().moving for one in chosen])
     if noisy := noisier_words(
         names, noise, [group.tolist() for group in groups], unit.name, unit.factor
@@ -288,7 +288,11 @@ def topic_findings(
 ) -> Iterator[Finding]:
     """Yield the troubles in the messages of each topic."""
     for one in chosen:
-        words = [f"{one.gaps} gaps of up to {one.longest:.2g} s"] if one.gaps else []
+        words = (
+            [f"{one.gaps} gaps of up to {figures(one.longest, 2)} s"]
+            if one.gaps
+            else []
+        )
         if words := words + troubles(one, unit):
             yield Finding(
                 Role.WARNING,

@@ -49,7 +49,7 @@ from fdi_ros.inspection.turns import (
 )
 from fdi_ros.inspection.urdf import Urdf
 from fdi_ros.model.samples import Array
-from fdi_ros.system.text import listed, shown
+from fdi_ros.system.text import figures, listed, shown
 
 #: topics of flight logs, which keep the numbers of the autopilot
 _LOG_TOPIC = re.compile(r"/imu_[0-9]{1,3}")
@@ -139,7 +139,7 @@ def assumed_config(path: Path) -> AssumedConfig:
     copies = f"{found.look}; " if found.look else ""
     words = (
         f"{copies}{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz,"
-        f" noise {low:.2g} to {high:.2g} rad/s,"
+        f" noise {figures(low, 2)} to {figures(high, 2)} rad/s,"
         f" scale factors within {100 * config.noise.scale_std[0]:g} %; `fdi setup` measures these"
     )
     return AssumedConfig(config, words, found.unused)
@@ -286,9 +286,7 @@ def _settings_of_units(
     if timeout := _longer(chosen, _BRIDGED, 10.0):
         slowest = min(report.rate for report in chosen)
         none = "none would be aligned between two"
-        words = (
-            f"messages come at {slowest:.3g} Hz: with the default {TIMEOUT:g} s {none}"
-        )
+        words = f"messages come at {figures(slowest)} Hz: with the default {TIMEOUT:g} s {none}"
         known["imus.timeout"] = timeout, words
     return known, mounted
 

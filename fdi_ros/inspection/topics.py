@@ -32,7 +32,7 @@ from fdi_ros.report.layout import (
     told,
 )
 from fdi_ros.system.files import NAME
-from fdi_ros.system.text import date_of, shown
+from fdi_ros.system.text import date_of, figures, shown
 
 #: intervals longer than this many usual ones are gaps
 GAP = 3.0
@@ -366,8 +366,8 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
             return "-"
         values = values * unit.factor
         if len(values) > 3:
-            return f"{np.nanmin(values):.2g} to {np.nanmax(values):.2g}"
-        return " ".join(f"{value:.2g}" for value in values)
+            return f"{figures(np.nanmin(values), 2)} to {figures(np.nanmax(values), 2)}"
+        return " ".join(figures(value, 2) for value in values)
 
     return [
         Column("name", [report.topic.name for report in reports], ("topic",), shown),
@@ -438,7 +438,7 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     """Describe a topic as possible gyros, with its troubles."""
     if not report.could_be_gyros:
         return "no"
-    largest = f"up to {report.largest * unit.factor:.3g} {unit.name}"
+    largest = f"up to {figures(report.largest * unit.factor)} {unit.name}"
     words = [
         f"{report.channels} gyros",
         largest if math.isfinite(report.largest) else "none with a rate",
@@ -458,7 +458,7 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
         low = np.nanmin(noise.quiet)
         high = np.nanmax(noise.quiet)
         words.append(
-            f"{report.channels} accelerometers, noise {low:.2g} to {high:.2g} {FORCE.unit}"
+            f"{report.channels} accelerometers, noise {figures(low, 2)} to {figures(high, 2)} {FORCE.unit}"
         )
     return ", ".join([*words, *troubles(report, unit)])
 
@@ -470,7 +470,7 @@ def burst_words(report: TopicReport) -> str:
 
 def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
     """List the troubles with the values of a topic, by their places in the message."""
-    beyond = f"beyond {BELIEVED * unit.factor:.3g} {unit.name}"
+    beyond = f"beyond {figures(BELIEVED * unit.factor)} {unit.name}"
     words = []
     for why, counts in (
         ("not finite", report.not_finite),

@@ -19,7 +19,7 @@ from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.model.quantity import FORCE
 from fdi_ros.monitor.output import Topic
 from fdi_ros.monitor.soundness import Concern, Word, live_word
-from fdi_ros.system.text import first_of, plus_minus, shown
+from fdi_ros.system.text import figures, first_of, plus_minus, shown
 
 if TYPE_CHECKING:
     from fdi_ros.monitor.status import ChannelStatus, Status, UnitStatus
@@ -637,7 +637,7 @@ def _seconds(value: float) -> str:
 
 
 def _figure(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "none"
+    return figures(value, 4) if math.isfinite(value) else "none"
 
 
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")

@@ -27,7 +27,7 @@ from fdi_ros.core.subsets import members
 from fdi_ros.model.quantity import FORCE, RATE
 from fdi_ros.model.samples import Array
 from fdi_ros.system import require
-from fdi_ros.system.text import date_of, html_table
+from fdi_ros.system.text import date_of, figures, html_table
 
 if TYPE_CHECKING:
     import pandas
@@ -79,7 +79,7 @@ _HEAD = ("stamp s", "channel", "change", "why")
 
 def format_reason(event: Event, names: Sequence[str]) -> str:
     """Return why a channel changed its state. Without names channels are numbered."""
-    size = f" by {abs(event.error):.3g} {event.unit}" if event.error else ""
+    size = f" by {figures(abs(event.error))} {event.unit}" if event.error else ""
     group = ", ".join(names[i] if names else f"channel {i}" for i in event.group)
     return (
         event.reason.value

@@ -39,6 +39,7 @@ from fdi_ros.monitor.output import (
     events_of,
 )
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.system.text import figures
 
 STANDING_TIME = 2_000_000_000  # ns of steady time. A simulation at a tenth of real time steps by 0.2 s
 RATE_TOLERANCE = 0.1  # relative difference to the configured rate that is reported
@@ -128,7 +129,7 @@ class SampleRateCheck:
         self.words = ""
         if abs(rate / self._configured - 1) > RATE_TOLERANCE:
             self.words = (
-                f"samples come at {rate:.3g} Hz, sample_rate is {self._configured:g} Hz:"
+                f"samples come at {figures(rate)} Hz, sample_rate is {self._configured:g} Hz:"
                 " the false-alarm rate and all times are wrong by as much"
             )
 

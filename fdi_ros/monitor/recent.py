@@ -27,6 +27,7 @@ from fdi_ros.monitor.soundness import (
     UnitHealth,
     concerns_of,
     is_declared,
+    own_noise,
 )
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ class RecentHealth:
         samples, missing, non_finite, at_end, spikes = last.counts - first.counts
         total = samples + missing
         unchecked = np.mean([one.unchecked for one in self._readings], axis=0)
-        rms = self._residual_rms(status)
+        noise = self._own_noise(status)
         measured = len(self._readings) >= LEAST_READINGS
         unit_of = {name: unit.name for unit in status.units for name in unit.channels}
         for i, one in enumerate(status.channels):
@@ -117,7 +118,7 @@ class RecentHealth:
                 noisy_s=one.last_noisy.seconds if self._was_noisy(status, one) else 0.0,
                 noisy_from_s=(one.last_noisy.since - status.stamp) / SECOND,
                 noisy_times=one.last_noisy.times,
-                residual_rms_rad_s=rms[i],
+                own_noise_rad_s=noise[i],
                 measured_in=one.unit,
             )
 
@@ -134,8 +135,8 @@ class RecentHealth:
         missing = published.count(False)
         return RateHealth(float(missing), None, 1.0 - missing / len(published))
 
-    def _residual_rms(self, status: Status) -> list[float | None]:
-        """Return the root mean square of each channel's residual, rad/s. None: not compared.
+    def _own_noise(self, status: Status) -> list[float | None]:
+        """Return the standard deviation of each channel's errors, rad/s. None: not compared.
 
         A declared fault disturbs the fused rate, so that no comparison is possible.
         """
@@ -144,10 +145,14 @@ class RecentHealth:
         if any(map(is_declared, status.channels)) or not enough.any():
             return [None] * len(status.channels)
         square = np.nansum(residuals**2, axis=0) / np.isfinite(residuals).sum(axis=0)
-        return [
-            math.sqrt(value) if known else None
-            for value, known in zip(square.tolist(), enough, strict=True)
-        ]
+        noise: list[float | None] = [None] * len(status.channels)
+        for quantity in dict.fromkeys(one.unit for one in status.channels):
+            half = [i for i, one in enumerate(status.channels) if one.unit == quantity]
+            rms = np.sqrt(np.where(enough, square, np.nan)[half])
+            axes = np.array([status.channels[i].axis for i in half])
+            for i, value in zip(half, own_noise(rms, axes).tolist(), strict=True):
+                noise[i] = value if math.isfinite(value) else None
+        return noise
 
     def _units(
         self, status: Status, inputs: Sequence[InputStatus]

@@ -19,7 +19,8 @@ import numpy as np
 
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.noise import much_noisier
-from fdi_ros.system.text import listed
+from fdi_ros.model.samples import Array
+from fdi_ros.system.text import figures, listed
 
 if TYPE_CHECKING:
     from fdi_ros.monitor.status import ChannelStatus, Status
@@ -32,6 +33,8 @@ LEAST_MISSING_S = 1.0
 """Time without a fused rate that is reported, s. Shorter outages are in the notes."""
 LEAST_NOISY_S = 3.0
 """Duration of noise that is reported, s."""
+LEAST_SHARE = 1e-3
+"""Smallest share of the errors of a channel that is taken to show in its residual."""
 LEAST_SPIKES = 3
 """Single wrong samples from which on a channel has spikes. Fewer may be chance."""
 
@@ -65,8 +68,8 @@ class ChannelHealth:
     """Number of single wrong samples."""
     saturated_s: float = 0.0
     """Time at the end of its range, s."""
-    residual_rms_rad_s: float | None = None
-    """Root mean square of its difference from the fused rate while it was OK, rad/s.
+    own_noise_rad_s: float | None = None
+    """Standard deviation of its own errors while it was OK, by `own_noise`, rad/s.
     None: never OK, or not measured."""
     noisy_s: float = 0.0
     """Duration of its longest spell of noise, s."""
@@ -155,6 +158,39 @@ def short_names(names: Sequence[str]) -> list[str]:
     return list(found)
 
 
+PASSES = 20
+"""Iterations of `own_noise`. It converges by more than a factor of two in each."""
+
+
+def own_noise(residual_rms: Array, axes: Array) -> Array:
+    """Return the standard deviation of the errors of each channel, (n,), rad/s.
+
+    The fused rate follows a quiet channel closely, so the residual of such a channel is
+    smaller than its errors. Of two parallel channels, the residuals show the weights
+    alone. The result is consistent with a fused rate that weights each channel by its
+    inverse variance.
+
+    Parameters
+    ----------
+    residual_rms
+        Root mean square of the difference from the fused rate, (n,), rad/s. NaN:
+        not measured, the channel is ignored.
+    axes
+        Sensitivity axes, (n, 3).
+    """
+    square = np.where(residual_rms > 0.0, residual_rms, np.nan) ** 2
+    known = np.isfinite(square)
+    variance = square.copy()
+    for _ in range(PASSES):
+        weight = np.where(known, 1.0 / variance, 0.0)
+        inverse = np.linalg.pinv(axes.T @ (weight[:, None] * axes), hermitian=True)
+        leverage = weight * np.einsum("ij,jk,ik->i", axes, inverse, axes)
+        share = np.maximum(1.0 - leverage, LEAST_SHARE)
+        variance = np.sqrt(variance * square / share)
+    result: Array = np.sqrt(variance)
+    return result
+
+
 def concerns_of(
     channels: Sequence[ChannelHealth],
     units: Sequence[UnitHealth] = (),
@@ -209,7 +245,7 @@ def concerns_of(
             Word.LOOK,
             lambda some: (
                 "measured the end of the range for"
-                f" {max(one.saturated_s for one in some):.2g} s"
+                f" {figures(max(one.saturated_s for one in some), 2)} s"
             ),
         ),
         *_rate_concerns(rate),
@@ -265,7 +301,7 @@ def _rate_concerns(rate: RateHealth | None) -> list[Concern]:
     word = Word.CANNOT_TELL if rate.share < LEAST_CHECKED else Word.LOOK
     since = rate.missing_from_s
     when = "" if since is None else f", first at {since:.1f} s"
-    words = f"was not published for {rate.missing_s:.3g} s{when}"
+    words = f"was not published for {figures(rate.missing_s)} s{when}"
     return [Concern(word, ("the fused rate",), words)]
 
 
@@ -275,15 +311,13 @@ def _is_slow(unit: UnitHealth) -> bool:
 
 def _slow_words(unit: UnitHealth) -> str:
     words = f"delivered {100 * unit.delivered:.0f} % of its messages"
-    if unit.slow_rate_hz is None:
+    if unit.slow_rate_hz is None or unit.rate_hz is None:
         return words
+    rates = f"{figures(unit.slow_rate_hz)} instead of {figures(unit.rate_hz)} Hz"
     if unit.slow_from_s is None:
-        return f"{words} ({unit.slow_rate_hz:.3g} instead of {unit.rate_hz:.3g} Hz)"
+        return f"{words} ({rates})"
     until = "to the end" if unit.slow_to_s is None else f"to {unit.slow_to_s:.0f} s"
-    return (
-        f"{words} ({unit.slow_rate_hz:.3g} instead of {unit.rate_hz:.3g} Hz from"
-        f" {unit.slow_from_s:.0f} s {until})"
-    )
+    return f"{words} ({rates} from {unit.slow_from_s:.0f} s {until})"
 
 
 def _alike(
@@ -326,7 +360,7 @@ def _noisy_for_a_time(channels: Sequence[ChannelHealth]) -> list[Concern]:
         began = first.noisy_from_s
         when = f"from {began:.1f} s" if began >= 0.0 else f"{-began:.0f} s ago"
         words = (
-            f"had noise {max(one.noisy_times for one in same):.2g} times as large as usual"
+            f"had noise {figures(max(one.noisy_times for one in same), 2)} times as large as usual"
             f" for {first.noisy_s:.1f} s, {when}"
         )
         names = tuple(one.name for one in channels if one in same)
@@ -350,7 +384,7 @@ def _noisy(channels: Sequence[ChannelHealth]) -> list[Concern]:
     """
     noise = np.array(
         [
-            math.nan if one.residual_rms_rad_s is None else one.residual_rms_rad_s
+            math.nan if one.own_noise_rad_s is None else one.own_noise_rad_s
             for one in channels
         ]
     )

@@ -92,6 +92,7 @@ class ChannelStatus:
     last_noisy: NoisySpell = NEVER_NOISY  #: Present or last spell of noise.
     longest_noisy: NoisySpell = NEVER_NOISY  #: Longest spell of noise so far.
     unit: str = RATE.unit  #: rad/s of a gyro, m/s^2 of an accelerometer.
+    axis: tuple[float, ...] = (0.0, 0.0, 0.0)  #: Sensitivity axis in the body.
 
     @property
     def is_left_out(self) -> bool:
@@ -277,7 +278,7 @@ def status_of(
         stamp=int(last["stamp"]) if begun else 0,
         samples=int(core["samples"]),
         detector=detector.name,
-        channels=tuple(_channel(core, i, names, quantity) for i in range(n)),
+        channels=tuple(_channel(core, i, geometry, quantity) for i in range(n)),
         statistic=float(last["statistic"]) if begun else math.nan,
         threshold=float(last["threshold"]) if begun else math.nan,
         has_rate=valid,
@@ -310,8 +311,9 @@ def status_of(
 
 
 def _channel(
-    core: Any, i: int, names: Sequence[str], quantity: Quantity
+    core: Any, i: int, geometry: Geometry, quantity: Quantity
 ) -> ChannelStatus:
+    names = geometry.channel_names
     natural = quantity.natural
     health = core["health"]
     state = ChannelState(core["state"][i])
@@ -349,6 +351,7 @@ def _channel(
         last_noisy=_spell(health["last_noisy"], i),
         longest_noisy=_spell(health["longest_noisy"], i),
         unit=quantity.unit,
+        axis=tuple(geometry.axes[i].tolist()),
     )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.report.layout import FORCES, RADIANS, Unit
-from fdi_ros.system.text import plus_minus
+from fdi_ros.system.text import figures, plus_minus
 
 GAP = 10.0
 """Gap between two stretches, s. A shorter hole is within a stretch: messages were lost."""
@@ -325,10 +325,11 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     std = size.std_rad_s * unit.factor
     figure = f"{plus_minus(abs(value), std)} {unit.name}"
     if size.course == "proportional":
-        # Two significant digits without an exponent.
-        share = float(f"{100 * (size.share_of_rate or 0.0):.2g}")
-        of = "specific force" if unit == FORCES else "rate"
-        return f"{share:+g} % of the {of}, {figure} rms"
+        share = size.share_of_rate or 0.0
+        of = true_quantity(unit)
+        if is_factor(share):
+            return f"{figures(1.0 + share, 2)} times the {of}, off by {figure} rms"
+        return f"{figures(100.0 * share, 2, '+')} % of the {of}, {figure} rms"
     if size.course == "noisy":
         return f"noise of {figure}"
     if size.course == "varying":
@@ -337,8 +338,18 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     if size.course == "gone":
         return f"{figure}, until {size.gone_s:.3f} s"
     if size.course == "growing":
-        return f"{figure}, growing to {size.last_rad_s * unit.factor:+.3g} {unit.name}"
+        return f"{figure}, growing to {figures(size.last_rad_s * unit.factor, 3, '+')} {unit.name}"
     return figure if size.course == "steady" else f"{figure}, {size.course}"
+
+
+def is_factor(share: float) -> bool:
+    """Whether a scale error is so large that words give the factor, not the percentage."""
+    return not -1.2 <= share <= 1.0
+
+
+def true_quantity(unit: Unit) -> str:
+    """Return what sensors with figures in a unit measure."""
+    return "specific force" if unit == FORCES else "rate"
 
 
 class _Measured(Protocol):
@@ -483,7 +494,7 @@ def _growth(one: Candidate, unit: Unit) -> str:
     if size is None or not size.slope_rad_s2:
         return ""
     first, last, slope = (
-        f"{value * unit.factor:+.3g}"
+        figures(value * unit.factor, 3, "+")
         for value in (size.rad_s, size.last_rad_s, size.slope_rad_s2)
     )
     return f"{one.channel} {size.course} by {slope} {unit.name} per second, from {first} to {last} {unit.name}"
@@ -493,7 +504,7 @@ def _evidence(one: Episode) -> str:
     """Describe the evidence for a declaration."""
     words = [one.evidence.reason] if one.evidence.reason else []
     if one.evidence.ratio is not None:
-        words.append(f"statistic {one.evidence.ratio:.3g} times its threshold")
+        words.append(f"statistic {figures(one.evidence.ratio)} times its threshold")
     if (
         one.state == "AMBIGUOUS"
         and one.evidence.last_alarm_s is not None
@@ -530,7 +541,7 @@ def _rate(one: Episode, unit: Unit) -> str:
     share = (
         "published throughout"
         if rate.published == 1.0
-        else f"published in {100 * rate.published:.3g} % of samples"
+        else f"published in {figures(100 * rate.published)} % of samples"
     )
     words = [share]
     if rate.std_rad_s is not None:
@@ -557,7 +568,7 @@ def stretch_words(story: Story) -> list[str]:
     lines = []
     for number, one in enumerate(story.stretches, 1):
         own = sum(episode.stretch == number for episode in story.declared)
-        share = f"{100 * one.judged / max(1, one.samples):.3g} % judged"
+        share = f"{figures(100 * one.judged / max(1, one.samples))} % judged"
         count = f"{own} episode{'s' if own != 1 else ''}" if own else "nothing declared"
         lines.append(
             f"stretch {number}: {one.start_s:.3f} s to {one.end_s:.3f} s, {share}, {count}"
@@ -566,7 +577,7 @@ def stretch_words(story: Story) -> list[str]:
 
 
 def _figure(value: float, unit: Unit) -> str:
-    return f"{value * unit.factor:.3g}"
+    return figures(value * unit.factor)
 
 
 def _seconds(value: float) -> str:

@@ -58,7 +58,7 @@ from fdi_ros.report.layout import (
 )
 from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.system import there
-from fdi_ros.system.text import date_of
+from fdi_ros.system.text import date_of, figures
 
 SEES_AXIS = 0.3
 """Smallest component of a channel's axis along a body axis for its curve to be drawn there."""
@@ -620,7 +620,7 @@ def _protection_levels(summary: Summary, unit: Unit) -> dict[str, str]:
         "after one more loss": levels.after_one_more_loss,
     }.items():
         words = (
-            "none" if value is None else f"{value * unit.factor:.4g}"
+            "none" if value is None else figures(value * unit.factor, 4)
             for value in values
         )
         axes = " ".join(

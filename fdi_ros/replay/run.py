@@ -33,7 +33,7 @@ from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.monitor.soundness import RateHealth, UnitHealth
+from fdi_ros.monitor.soundness import RateHealth, UnitHealth, own_noise
 from fdi_ros.monitor.status import ChannelStatus, Status
 from fdi_ros.replay.episodes import GAP, Story, join_halves, pieces
 from fdi_ros.replay.health import Deliveries, Values, with_context, with_delivery
@@ -312,6 +312,8 @@ class Judge(Walk):
         units = [
             unit for half in self.pipeline.halves for unit in half.geometry.unit_of
         ]
+        residual_rms = evaluation.residual_rms
+        noise = self._own_noise(residual_rms)
         for i, status in enumerate(statuses):
             changes = [one for one in evaluation.events if one.channel == status.name]
             before = [one for one in changes if one.at_s <= end]
@@ -339,7 +341,8 @@ class Judge(Walk):
                 noisy_s=noisy.seconds,
                 noisy_from_s=evaluation.time(noisy.since) if noisy.since else 0.0,
                 noisy_times=noisy.times,
-                residual_rms_rad_s=evaluation.residual_rms[i],
+                own_noise_rad_s=noise[i],
+                residual_rms_rad_s=residual_rms[i],
                 doubt=_doubt_words(state, since, reason, end),
                 state=state,
                 since_s=since,
@@ -348,6 +351,15 @@ class Judge(Walk):
                 noise=status.noise or None,
                 unchecked=unchecked,
             )
+
+    def _own_noise(self, residual_rms: Sequence[float | None]) -> list[float | None]:
+        """Return the noise of each channel, rad/s. None: never OK."""
+        left = np.array(residual_rms, dtype=np.float64)
+        found: list[float | None] = []
+        for half in self.pipeline.halves:
+            own, left = np.split(left, [half.geometry.n])
+            found += map(finite, own_noise(own, half.geometry.axes).tolist())
+        return found
 
     def _units(self, status: Status) -> Iterator[UnitHealth]:
         """Yield the health of each unit, or of the one topic with all channels."""

@@ -39,6 +39,9 @@ class ChannelResult(ChannelHealth):
     """Reason for the state. Empty: none."""
     bias_followed: float
     """Drift of its bias against the other channels since the start, rad/s."""
+    residual_rms_rad_s: float | None
+    """Root mean square of its difference from the fused rate while it was OK, rad/s.
+    None: never OK."""
     noise: float | None
     """Its noise at the end, in ``noise.noise_std``. None: not measured."""
     unchecked: float
@@ -199,7 +202,7 @@ class Judgement:
         """
         channels: Sequence[ChannelHealth] = self.monitor.channels
         if self.story.declared:
-            channels = [replace(one, residual_rms_rad_s=None) for one in channels]
+            channels = [replace(one, own_noise_rad_s=None) for one in channels]
         return concerns_of(channels, self.monitor.units, rate=self.monitor.rate)
 
 

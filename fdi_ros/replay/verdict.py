@@ -13,10 +13,17 @@ from collections.abc import Sequence
 
 from fdi_ros.core.states import Reason
 from fdi_ros.monitor.soundness import Word, word_of
-from fdi_ros.replay.episodes import MOST_TOLD, Episode, Size, unit_for
+from fdi_ros.replay.episodes import (
+    MOST_TOLD,
+    Episode,
+    Size,
+    is_factor,
+    true_quantity,
+    unit_for,
+)
 from fdi_ros.replay.summary import Judgement, ReplayVerdict
 from fdi_ros.report.layout import RADIANS, Unit
-from fdi_ros.system.text import first_of, listed
+from fdi_ros.system.text import figures, first_of, listed
 
 LEAST_JUDGED = 0.5
 """Share of the samples that must be judged for a verdict."""
@@ -228,11 +235,11 @@ def _size_sentences(one: Episode, unit: Unit) -> list[str]:
                 ]
             )
             return [f"Its error {verb} from {begins.pop()} to {ends} {unit.name}."]
-    words = [
-        f"{axis} {words}" if axis else words
-        for axis, size in sizes.items()
-        if (words := _size_words(size, unit))
-    ]
+    by_axis = {axis: _size_words(size, unit) for axis, size in sizes.items()}
+    (common, *others) = dict.fromkeys(by_axis.values())
+    if common and not others and len(by_axis) > 1:
+        return [f"Each axis {common}."]
+    words = [f"{axis} {words}".strip() for axis, words in by_axis.items() if words]
     if not words:
         return ["Its error is too small to measure."]
     return [f"Its error: {'; '.join(words)}." if len(words) > 1 else f"It {words[0]}."]
@@ -242,10 +249,7 @@ def _size_words(size: Size, unit: Unit) -> str:
     """Describe an error, as it continues ``It``. Empty: too small to measure."""
     value = _size(size, unit)
     if size.course == "proportional":
-        share = 100.0 * abs(size.share_of_rate or 0.0)
-        low = (size.share_of_rate or 0.0) < 0
-        words = f"{share:.0f}" if share >= 10.0 else f"{share:.2g}"
-        return f"reads {words} % too {'little' if low else 'much'}"
+        return f"reads {_share_words(size.share_of_rate or 0.0, unit)}"
     if size.course == "noisy":
         return f"has noise of {value} {unit.name}"
     if size.course == "varying":
@@ -258,6 +262,13 @@ def _size_words(size: Size, unit: Unit) -> str:
         last = _rate(size.last_rad_s, size.std_rad_s, unit)
         return f"is off by {value}, {size.course} to {last} {unit.name}"
     return f"is off by {value} {unit.name}"
+
+
+def _share_words(share: float, unit: Unit) -> str:
+    """Describe a scale error: ``5 % too much``, or ``8.0 times the true rate``."""
+    if is_factor(share):
+        return f"{figures(1.0 + share, 2)} times the true {true_quantity(unit)}"
+    return f"{figures(100.0 * abs(share), 2)} % too {'little' if share < 0 else 'much'}"
 
 
 def _reason_sentences(one: Episode) -> list[str]:

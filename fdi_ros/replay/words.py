@@ -41,7 +41,7 @@ from fdi_ros.report.layout import (
     number,
     section_text,
 )
-from fdi_ros.system.text import first_of, listed, shown
+from fdi_ros.system.text import figures, first_of, listed, shown
 
 AUTOPILOT_LOGS = (".bin", ".tlog")
 """Suffixes of the logs of ArduPilot."""
@@ -150,7 +150,7 @@ def sample_rate_notes(rate: SampleRate) -> list[str]:
     if abs(rate.recorded_hz / rate.configured_hz - 1) <= RATE_TOLERANCE:
         return []
     return [
-        f"sample_rate is {rate.configured_hz:g} Hz in the config and {rate.recorded_hz:.4g} Hz"
+        f"sample_rate is {rate.configured_hz:g} Hz in the config and {figures(rate.recorded_hz, 4)} Hz"
         " in the recording: the false-alarm rate is wrong by the same factor"
     ]
 
@@ -246,7 +246,7 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
         "checked": lambda row: f"{100 * min(one.checked for one in row[1]):.0f} %",
         "spikes": lambda row: str(sum(one.spikes for one in row[1])),
         "at end of range": lambda row: (
-            f"{max(one.saturated_s for one in row[1]):.2g} s"
+            f"{figures(max(one.saturated_s for one in row[1]), 2)} s"
         ),
         f"noise, {unit.name}": lambda row: number(_noise(row[1], unit), ".2g"),
         f"noise, {FORCES.name}": lambda row: number(_noise(row[1], FORCES), ".2g"),
@@ -274,11 +274,11 @@ def _temperature_words(unit: UnitHealth) -> str:
 
 
 def _noise(channels: Sequence[ChannelResult], unit: Unit) -> float | None:
-    """Return the largest rms residual of the channels measured in a unit. None: not measured."""
+    """Return the largest noise of the channels measured in a unit. None: not measured."""
     known = [
-        one.residual_rms_rad_s * unit.factor
+        one.own_noise_rad_s * unit.factor
         for one in channels
-        if one.residual_rms_rad_s is not None
+        if one.own_noise_rad_s is not None
         and (one.measured_in == FORCES.name) == (unit == FORCES)
     ]
     return max(known, default=None)

@@ -175,7 +175,10 @@ def indented(lines: Iterable[str]) -> str:
 
 def number(value: float | None, form: str = ".3f", unit: str = "") -> str:
     """Return a number with a unit, or a dash if the number is unknown or not finite."""
-    return "-" if value is None or not math.isfinite(value) else f"{value:{form}}{unit}"
+    if value is None or not math.isfinite(value):
+        return "-"
+    text = f"{value:{form}}"
+    return f"{f'{value:.0f}' if 'e+' in text else text}{unit}"
 
 
 def milliseconds(seconds: float | None) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 
 from fdi_ros.model.samples import Array
 from fdi_ros.report.layout import RADIANS, Section, Unit, colour_of, drawn
+from fdi_ros.system.text import figures
 
 PIECE = 512
 """Samples of each averaged spectrum."""
@@ -114,13 +115,14 @@ class Spectrum:
         words = []
         if found:
             lines = ", ".join(
-                f"{at:.3g} Hz ({self._rate - at:.3g} Hz if folded)" for at in found
+                f"{figures(at)} Hz ({figures(self._rate - at)} Hz if folded)"
+                for at in found
             )
             words.append(f"Lines stand out at {lines}.")
         if (around[-1] > FLAT * np.median(density, axis=0)).any():
             words.append(
-                f"It does not fall off towards {half:.3g} Hz, half the sample rate: that is white noise, or vibration"
-                " beyond it that is folded down into this picture. A recording at a higher rate tells which."
+                f"It does not fall off towards {figures(half)} Hz, half the sample rate: that is white noise, or"
+                " vibration beyond it that is folded down into this picture. A recording at a higher rate tells which."
             )
         return " ".join(words)
 

@@ -46,7 +46,7 @@ from fdi_ros.monitor.recent import RecentHealth
 from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.monitor.status import ApartStatus, Status
 from fdi_ros.ros.node import OVERRIDABLE, REPORT_PERIOD, BoundedLog, CheckedNode
-from fdi_ros.system.text import LINE, shown
+from fdi_ros.system.text import LINE, figures, shown
 
 REMEMBERED = 4096  # samples whose latency is remembered
 MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood
@@ -460,7 +460,7 @@ class Running:
             return "no fused rate, so nothing says that the vehicle is at rest"
         limit = self.receiver.pipeline.config.bias.max_rest_rate
         return (
-            f"in motion, {rate:.3g} rad/s, expected at most {limit:g} rad/s"
+            f"in motion, {figures(rate)} rad/s, expected at most {limit:g} rad/s"
             if rate > limit
             else ""
         )

@@ -30,7 +30,7 @@ from fdi_ros.model.quantity import FORCE, RATE
 from fdi_ros.monitor.diagnostics import INPUT, WHOLE, Level, StatusLine, parse_number
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.ros.node import read_diagnostics
-from fdi_ros.system.text import LINE, shown
+from fdi_ros.system.text import LINE, figures, shown
 
 try:
     from rich.bar import Bar
@@ -350,7 +350,8 @@ def _format_figures(picture: Picture) -> str:
     if picture.rate is not None and not picture.is_silent("fused"):
         rate = f"fused rate{''.join(f' {value:+.3f}' for value in picture.rate)} rad/s"
     if picture.evidence is not None:
-        evidence = "evidence {:.3g} of {:.3g}".format(*picture.evidence)
+        statistic, threshold = map(figures, picture.evidence)
+        evidence = f"evidence {statistic} of {threshold}"
     hertz, late = (
         picture.whole.value(key) or "none"
         for key in ("sample rate (Hz)", "latency p99 (ms)")
@@ -467,7 +468,7 @@ def _figure_table(picture: Picture) -> Table:
             min(statistic, threshold),
             color="red" if statistic >= threshold else "cyan",
         )
-        table.add_row("evidence", bar, f"{statistic:.3g} of {threshold:.3g}")
+        table.add_row("evidence", bar, f"{figures(statistic)} of {figures(threshold)}")
     return table
 
 

@@ -42,6 +42,7 @@ from fdi_ros.setup.estimate import (
 )
 from fdi_ros.setup.noise import projector
 from fdi_ros.setup.positions import delays_of, turning_of
+from fdi_ros.system.text import figures
 
 #: Smallest share of usable samples of an accelerometer, relative to the median of all
 #: (counted as at least this share, too).
@@ -202,12 +203,13 @@ def _check_forces(z: Array, units: Sequence[str], unit: Int, axes: Array) -> Non
     name = units[whole[odd]]
     if not LEAST_RESPONSE < ratio[odd] < 1.0 / LEAST_RESPONSE:
         raise DisagreementError(
-            f"the accelerometers of {name} measure {ratio[odd]:.3g} times the specific force of the others: look"
+            f"the accelerometers of {name} measure {figures(ratio[odd])} times the specific force of the others: look"
             " at its unit (m/s^2), or name them in excluded_channels"
         )
     if IN_G[0] < np.median(size) < IN_G[1]:
         raise CalibrationError(
-            f"the accelerometers measure {np.median(size):.3g} m/s^2 in the median, expected about 9.8: they are in g"
+            f"the accelerometers measure {figures(np.median(size))} m/s^2 in the median,"
+            " expected about 9.8: they are in g"
         )
     directions = forces / np.maximum(sizes, 1e-9)[:, :, None]
     cosine = np.median(np.einsum("jna,kna->jkn", directions, directions), axis=2)

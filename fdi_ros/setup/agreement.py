@@ -34,6 +34,7 @@ from fdi_ros.inspection.turns import (
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.setup.blocks import Data
+from fdi_ros.system.text import figures
 
 #: smallest response of a channel to the rotation of others, and the reverse
 LEAST_RESPONSE = 0.3
@@ -107,7 +108,7 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
     if 2 * len(most) > len(turns.units):
         ratio = np.median(turns.ratio[odd, most])
         raise DisagreementError(
-            f"{turns.names[odd]} measures {ratio:.3g} times the rotation of"
+            f"{turns.names[odd]} measures {figures(ratio)} times the rotation of"
             f" {_joined(turns, most)}: repair it {_OR_EXCLUDE}"
         )
     raise DisagreementError(_other_rotations(turns))
@@ -184,7 +185,7 @@ def _other_rotations(turns: _Turns) -> str:
     high = int(typical.argmax())
     return (
         f"{' and '.join(turns.names)} measure different rotations, and the data cannot tell"
-        f" which is right: {turns.names[high]} measures {turns.ratio[high, low]:.3g} times"
+        f" which is right: {turns.names[high]} measures {figures(turns.ratio[high, low])} times"
         f" the rotation of {turns.names[low]}; repair one"
     )
 
@@ -229,7 +230,9 @@ def _check_response(moving: Array, nominal: Geometry) -> None:
         if not (found := _contradictions(square, nominal.axes, i)):
             continue
         response, seen = np.median(found, axis=0).tolist()
-        shows = f"{response:.0%} of" if abs(response) < 1 else f"{response:.3g} times"
+        shows = (
+            f"{response:.0%} of" if abs(response) < 1 else f"{figures(response)} times"
+        )
         alike = [
             nominal.channel_names[j] for j in np.flatnonzero(nominal.group_matrix[i])
         ]
@@ -334,7 +337,7 @@ def _against(first: Array, unit: Array) -> Mount:
         np.maximum(np.linalg.eigvalsh(unit.T @ unit / len(unit)), 0.0)
     )[:0:-1]
     if most < LEAST_RATE:
-        return Mount(f"NOT KNOWN: it does not turn ({most:.2g} rad/s rms)")
+        return Mount(f"NOT KNOWN: it does not turn ({figures(most, 2)} rad/s rms)")
     rotation, mirrored, uncertainty = find_turn(first, unit)
     if math.isinf(uncertainty):
         return Mount(
@@ -357,7 +360,7 @@ def _against(first: Array, unit: Array) -> Mount:
         words = f"NOT KNOWN: it does not measure the rotation of the first unit ({max(shared, 0.0):.0%} shared)"
         return Mount(words, shared, contradicts=True)
     if error > LARGEST_ERROR:
-        words = f"it turns too little about a second axis ({most:.2g} and {second:.2g} rad/s rms)"
+        words = f"it turns too little about a second axis ({figures(most, 2)} and {figures(second, 2)} rad/s rms)"
         return Mount(
             f"NOT KNOWN: {words}: uncertain by {min(np.degrees(error), 180.0):.1f} deg",
             shared,

@@ -58,7 +58,7 @@ from fdi_ros.setup.run import (
     Tried,
     times_words,
 )
-from fdi_ros.system.text import LINE, first_of, shown
+from fdi_ros.system.text import LINE, figures, first_of, shown
 
 #: uncertainty of the axes along a direction of the body from which they are not well
 #: shown
@@ -470,7 +470,7 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
     yield Finding(
         Role.FOUND,
         "channels",
-        f"{g.n} channels in {where} at {rate:.4g} Hz",
+        f"{g.n} channels in {where} at {figures(rate, 4)} Hz",
         value=rate,
     )
     if known := sum(mount.shown for mount in found.mounts[1:]):

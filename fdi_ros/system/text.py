@@ -77,10 +77,19 @@ def _without_digits(word: str) -> str:
     return "".join(letter for letter in word if not letter.isdigit())
 
 
+def figures(value: float, digits: int = 3, sign: str = "") -> str:
+    """Write a number with some significant digits, a large one in full: ``1250``, not ``1.2e+03``.
+
+    ``sign``: ``+`` writes the sign of positive numbers too.
+    """
+    text = f"{value:{sign}.{digits}g}"
+    return f"{value:{sign}.0f}" if "e+" in text else text
+
+
 def plus_minus(value: float, std: float) -> str:
     """Write a value with its standard error, rounded to the error: `0.10 +- 0.03`."""
     if not math.isfinite(std) or std <= 0.0:
-        return f"{value:.3g}"
+        return figures(value)
     exponent = math.floor(math.log10(std))
     places = max(0, min(9, (1 if std < 2 * 10**exponent else 0) - exponent))
     return f"{value:.{places}f} +- {std:.{places}f}"

@@ -6,8 +6,10 @@
 import os
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from bag.logs import SCALED, telemetry, units, write_ulog
 from bag.recordings import START, imu, write_mcap
 from mavlink.autopilots import Autopilot
@@ -112,12 +114,12 @@ def test_the_shared_case_of_bursts_is_judged_at_its_rate():
     assert "/imu_1 is left out" in words
 
 
+@pytest.mark.parametrize("packing", [zstandard, lz4.frame])
 @pytest.mark.parametrize("name", ["zstd", "none"])
 def test_messages_that_were_compressed_one_by_one_are_read_as_any_others(
-    name, tmp_path
+    name, packing, tmp_path
 ):
     """Of topics that cannot be gyros they stay as they are."""
-    import zstandard
 
     time, rates = drive(seconds=4.0)
     plain = write_bag(tmp_path / "plain.mcap", time, rates)
@@ -127,7 +129,7 @@ def test_messages_that_were_compressed_one_by_one_are_read_as_any_others(
             for k, at in enumerate(batch.log_time.tolist()):
                 topic = f"/imu_{int(batch.topic[k])}/data"
                 messages.append((topic, at, batch.message(k)))
-    packed = [(topic, at, zstandard.compress(data)) for topic, at, data in messages]
+    packed = [(topic, at, packing.compress(data)) for topic, at, data in messages]
     kind = CompressionType.ZSTD if name == "zstd" else CompressionType.NONE
     write_mcap(tmp_path / "packed.mcap", packed, kind)
     found = []
@@ -220,7 +222,7 @@ def test_a_steady_turn_with_vibration_is_no_bias_in_degrees(tmp_path, fdi):
 
 @pytest.mark.parametrize(
     ("offset", "words"),
-    [(37, "37 s ahead"), (-START // 10**9 + 12, "1.7e+09 s behind")],
+    [(37, "37 s ahead"), (-START // 10**9 + 12, f"{START // 10**9 - 12} s behind")],
 )
 def test_stamps_of_other_clocks_are_said_by_replay_itself(
     offset, words, tmp_path, refused

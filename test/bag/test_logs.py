@@ -612,7 +612,7 @@ def test_instances_without_end_are_no_instances(tmp_path):
         message, size, TimeUS=1000 * np.arange(size), I=np.arange(size)
     )
     path.write_bytes(format_record(70, "IMU", *message[1:]) + records.tobytes())
-    assert "this autopilot logged no other (IMU of 1 IMU at 1e+03 Hz)" in refusal(path)
+    assert "this autopilot logged no other (IMU of 1 IMU at 1000 Hz)" in refusal(path)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from monitor.streams import RATE, parallel, stream, struck
+import pytest
+from monitor.streams import RATE, SIGMA, parallel, stream, struck
 from numpy.typing import NDArray
 
 from fdi_ros.core.states import ChannelState
@@ -16,7 +17,7 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.diagnostics import InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.recent import RecentHealth
-from fdi_ros.monitor.soundness import Word, live_word
+from fdi_ros.monitor.soundness import LEAST_NOISY_S, Word, live_word
 
 SECOND = round(RATE)
 
@@ -79,6 +80,22 @@ def test_noise_is_reported_while_it_lasts_and_for_a_minute():
         r"imu_2.y had noise [\d.]+ times as large as usual for \d+\.\d s, \d+ s ago",
         lines[30].message,
     )
+
+
+@pytest.mark.parametrize(("vibration", "noisy"), [(4.5, False), (12.0, True)])
+def test_vibration_that_the_units_show_unequally_is_no_noise_of_one(vibration, noisy):
+    """The usual noise of a flight is not that of the ground, where settings expect more than both."""
+    pipeline = Pipeline(
+        parallel(3, detector__name="sequential", noise__noise_std=5.0 * SIGMA)
+    )
+    block = stream(pipeline.geometry, 50 * SECOND, 0.3)
+    more = SIGMA * np.sqrt(np.repeat([4.0, vibration**2, 4.0], 3) - 1.0)
+    random = np.random.default_rng(0)
+    block.z[25 * SECOND :] += random.normal(0.0, more, (25 * SECOND, 9))
+    pipeline.process(block)
+    longest = [one.longest_noisy.seconds for one in pipeline.status().channels]
+    assert (max(longest) >= LEAST_NOISY_S) is noisy
+    assert max(longest[:3] + longest[6:]) == 0.0
 
 
 def test_a_slow_unit_is_named_with_both_rates_however_long_it_lasts():

@@ -24,6 +24,7 @@ from fdi_ros.monitor.soundness import (
     UnitHealth,
     Word,
     concerns_of,
+    own_noise,
     short_names,
     word_of,
 )
@@ -158,6 +159,9 @@ def test_the_faulty_unit_is_named_after_its_topic(topics, faulty, fdi, tmp_path)
         ),
         ("kind=dropout start=12 stop=13", "Reason: not a finite number."),
         ("kind=scale size=-1 start=12", "It reads 100 % too little."),
+        ("kind=scale size=0.2 start=12", "It reads 20 % too much."),
+        ("kind=scale size=7 start=12", "It reads 8 times the true rate."),
+        ("kind=sign start=12", "It reads -1 times the true rate."),
     ],
 )
 def test_a_fault_is_one_plain_sentence(fault, sentence, fdi, tmp_path):
@@ -176,6 +180,20 @@ def test_a_fault_is_one_plain_sentence(fault, sentence, fdi, tmp_path):
     assert re.match(r"FAULTY: imu_1\.y .*from 1[2-9]\.\d s", first), first
     size = first.partition(" s. ")[2]
     assert size.partition(" First seen")[0] == sentence
+
+
+def test_own_noise_is_that_of_the_channel_and_not_of_its_weight():
+    """A quiet channel carries the fused rate, so its residual is smaller than its errors."""
+    axes = np.tile(np.eye(3), (3, 1))
+    noise = np.array([0.01, 0.01, 0.02, 0.026, 0.04, 0.03, 0.01, 0.02, 0.02])
+    weight = noise**-2.0
+    inverse = np.linalg.inv(axes.T @ (weight[:, None] * axes))
+    left = np.eye(9) - axes @ inverse @ axes.T * weight
+    residual = np.sqrt((left**2) @ noise**2)
+    assert residual[3] > 3 * residual[0]
+    assert own_noise(residual, axes) == pytest.approx(noise, rel=1e-3)
+    residual[4] = np.nan
+    assert np.isfinite(own_noise(residual, axes)).tolist() == [k != 4 for k in range(9)]
 
 
 # Deliveries and values

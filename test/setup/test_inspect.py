@@ -238,7 +238,7 @@ def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, fdi, refused):
         in shown
     )
     assert (
-        "3 gyros, none with a rate, beyond 1e+06 rad/s: 20 of x and 20 of y and 20 of z\n"
+        "3 gyros, none with a rate, beyond 1000000 rad/s: 20 of x and 20 of y and 20 of z\n"
         in shown
     )
     made = tmp_path / "c.yaml"
@@ -247,7 +247,7 @@ def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, fdi, refused):
     assert f"{made} is not written: bag.mcap NEEDS {NEEDED}" in said
     for words in (
         "usable: only /good",
-        "/nan: no message in which all values are finite and below 1e+06 rad/s",
+        "/nan: no message in which all values are finite and below 1000000 rad/s",
         "/huge: no message in which all values",
         "/a b: no name that ROS allows",
         "/fused: a monitor has published it",
