@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from fdi_ros.mavlink.failover_evidence import SILENT, Evidence
+from fdi_ros.mavlink.failover_evidence import CURRENT, SILENT, Evidence
 from fdi_ros.mavlink.failover_file import FailoverFile, Saved
 from fdi_ros.mavlink.failover_policy import (
     VEHICLE,
@@ -69,7 +69,7 @@ class Failover:
     settings
         Settings of the policy.
     path
-        File that keeps the IMUs out of use. Raises `ConfigError` if unusable.
+        File that keeps the IMUs out of use.
     clocks
         Returns the clocks of this computer.
     """
@@ -96,6 +96,8 @@ class Failover:
         self.age = math.nan
         self.evidence = Evidence(count, interval, settings.min_size)
         self._file = FailoverFile(path, count)
+        if self._file.trouble:
+            vehicle.events.append(self._file.trouble)
         saved = self._file.written
         self._system = saved.system
         self._state = PolicyState.begin(count, saved.out)
@@ -124,7 +126,8 @@ class Failover:
         """Whether a stop now leaves nothing to put back: in flight, IMUs stay out."""
         pairs = zip(self._state.memories, self.evidence.imus, strict=True)
         waits = any(
-            memory.ours and imu.ok and not memory.without_notch for memory, imu in pairs
+            memory.ours and imu.ok and imu.agreed and not memory.without_notch
+            for memory, imu in pairs
         )
         return self._vehicle.armed or not self._vehicle.in_reach or not waits
 
@@ -241,9 +244,12 @@ class Failover:
             self._conversation = vehicle.begun
             self._forget()
         names = PARAMETERS[: len(self._values)]
+        stamps = [track.stamp for track in vehicle.units.values()]
+        is_late = now - max(stamps, default=0) > CURRENT
         while vehicle.parameters:
             name, value = vehicle.parameters.popleft()
-            if name in names:
+            # What comes beside old samples is as old, perhaps from before our orders.
+            if name in names and not is_late:
                 self._values[names.index(name)] = (value != 0, now)
         usual = READ_EVERY if vehicle.armed else READ_ON_GROUND
         pause = READ_HURRIED if self._hurry else usual
@@ -357,7 +363,10 @@ class Failover:
                 (imu.agreed is None, f"{name} agrees with none"),
                 (not imu.judged, f"{name} is not judged"),
             ]
-        checks += [(len(names) < 3, "two IMUs: no third to decide")]
+        checks += [
+            (bool(self._file.trouble), "failover_file is not usable"),
+            (len(names) < 3, "two IMUs: no third to decide"),
+        ]
         return next((words for holds, words in checks if holds and words), "")
 
     def _is_slow(self, view: View, now: int) -> bool:

@@ -52,12 +52,15 @@ SMOOTH = 5.0
 WINDOWS = 4
 #: An oscillation had the other sign, and half the size, within this time, ns.
 TURNED = 300 * MS
-#: An IMU that the monitor doubts agrees only while the difference scatters by less, rad/s,
+#: An IMU that the monitor doubts agrees only while the difference scatters by less, rad/s.
 CALM = 0.1
-#: and once another one has turned by this, rad/s: a dead gyro agrees with one at rest.
+#: It agrees, like one that is out of use, only once another one has turned by this on
+#: average, rad/s: a dead gyro agrees with one at rest.
 TURNING = 0.1
 WILD = 1.0  #: An oscillation with this standard deviation is an error, rad/s.
 SKEW = 20 * MS  #: Two IMUs may measure this far apart in time, ns.
+#: Allowed for in a mean difference, ns: more would hide errors while the vehicle shakes.
+USUAL_SKEW = 5 * MS
 #: The last samples must all differ by `LARGE` or `CLEAR`: those of at least this time,
 #: ns, and at least `FEWEST` of them.
 QUICK = 50 * MS
@@ -192,6 +195,25 @@ class RawComparison:
         """Return the largest rate of an IMU within `AVERAGED`, rad/s."""
         rates = list(self._recent[unit])[-self._averaged :]
         return max(math.hypot(*rate) for rate in rates) if rates else math.nan
+
+    def shift(self, unit: int, other: int) -> Vector:
+        """Return the mean difference of two healthy IMUs that measure `USUAL_SKEW` apart.
+
+        By axis, rad/s: of the rate that both gain, or both lose, within `AVERAGED`.
+        """
+        gains = []
+        for k in (unit, other):
+            rates = list(self._recent[k])[-self._averaged :]
+            ends = zip(rates[0], rates[-1], strict=True)
+            gains.append([last - first for first, last in ends])
+        share = USUAL_SKEW / AVERAGED
+        x, y, z = (share * abs(_steady(pair)) for pair in zip(*gains, strict=True))
+        return x, y, z
+
+    def turn(self, unit: int) -> float:
+        """Return the mean rate of an IMU within `AVERAGED`, rad/s: that of a turn."""
+        rates = list(self._recent[unit])[-self._averaged :]
+        return math.hypot(*np.mean(rates, axis=0)) if rates else math.nan
 
     def is_stuck(self, unit: int) -> bool:
         """Return whether an IMU has repeated one value while another one moved."""
@@ -449,9 +471,10 @@ class Evidence:
                 self._compared[j, k] = now
                 quick = self.raw.steady(j, k, now)
                 scale = SCALE * min(self.raw.rate(j), self.raw.rate(k))
+                shifts = self.raw.shift(j, k)
                 for axis, mean in enumerate(difference.mean):
                     spread = difference.spread[axis]
-                    size = max(0.0, abs(mean) - scale)
+                    size = max(0.0, abs(mean) - scale - shifts[axis])
                     is_wild = math.hypot(mean, spread) >= WILD + scale
                     is_steady = difference.steady[axis] or abs(quick[axis]) >= LARGE
                     means[axis] = size
@@ -493,9 +516,12 @@ class Evidence:
             self._agreed[unit] = self._turned[unit] = None
         elif agreeing:
             self._agreed[unit] = self._agreed[unit] or now
-            if max(map(self.raw.rate, agreeing)) >= TURNING:
+            # A mean that is no steady error yet may be the begin or end of a turn.
+            alike = [k for k in agreeing if self._agree(unit, k, doubted=True)]
+            if any(self.raw.turn(k) >= TURNING for k in alike):
                 self._turned[unit] = self._turned[unit] or now
-        return self._turned[unit] if doubted else self._agreed[unit]
+        must_turn = doubted or is_out
+        return self._turned[unit] if must_turn else self._agreed[unit]
 
     def _note_names(self, unit: int, agreed: int | None, now: int) -> None:
         """Note which axes were named before the IMU has agreed for long."""

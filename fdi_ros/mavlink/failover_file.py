@@ -4,6 +4,7 @@
 """The file with the IMUs that failover left out of use: INS_USE outlives power and companion.
 
 A thread writes, because a slow card may hold fsync for seconds while the link must go on.
+A file that cannot be read or written ends nothing: the vehicle may be in flight.
 """
 
 from __future__ import annotations
@@ -32,31 +33,40 @@ class Saved(NamedTuple):
 
 
 class FailoverFile:
-    """Reads and writes the file. Raises `ConfigError` at the start if either fails."""
+    """Reads and writes the file of a vehicle with count IMUs.
+
+    A file that cannot be read counts as one that lists no IMU, and is written anew.
+    """
 
     def __init__(self, path: Path, count: int) -> None:
         self._path = path
-        self.written = self._read(count)  #: Content on the disk.
-        self._write(self.written)
+        self.written = Saved()  #: Content on the disk, as far as known.
+        #: Why the file is not read or not written. Empty: it is.
+        self.trouble = ""
+        try:
+            self.written = self._read(count)
+            self._write(self.written)
+        except ConfigError as error:
+            self.trouble = str(error)
         self._wanted = self.written
         self._thread = ThreadPoolExecutor(max_workers=1)
         self._job: Future[None] | None = None
         self._retry = 0
 
     def keep(self, saved: Saved, now: int) -> str:
-        """Write new content in another thread. Return an error, or an empty text."""
-        error = ""
+        """Write new content in another thread. Return an error that is new, or an empty text."""
+        before = self.trouble
         self._wanted = saved
         if self._job is not None and self._job.done():
             cause = self._job.exception()
             self._job = None
+            self.trouble = "" if cause is None else str(cause)
             if cause is not None:
-                error = str(cause)
                 self._retry = now + 1_000_000_000
-        differs = saved[:2] != self.written[:2]
-        if differs and self._job is None and now >= self._retry:
+        is_due = self.trouble or saved[:2] != self.written[:2]
+        if is_due and self._job is None and now >= self._retry:
             self._job = self._thread.submit(self._write, saved)
-        return error
+        return self.trouble if self.trouble != before else ""
 
     def close(self) -> None:
         """Write the last content, if that has not been done. Raise `ConfigError` if it fails."""

@@ -28,12 +28,13 @@ Definitions
 
 Rules, in this order at each tick
     1. A held IMU goes back in use if the operator asks; if every other IMU is dead or out
-       of use; or if the IMU has not been apart for a pause. The pause is `PAUSE`, doubled
-       each time the IMU is taken out in one flight. In flight the last case needs a live
-       monitor, and an IMU that the monitor finds OK goes back at once if all that are in
-       use are bad. On the ground the IMU stays out until the monitor finds it OK. An IMU
-       that was out when the autopilot started has no notch filters: only the operator or
-       rule 4 puts it back.
+       of use; or if the IMU has not been apart for a pause, counted from a turn: at rest
+       a gyro that has lost its scale agrees too. The pause is `PAUSE`, doubled each time
+       the IMU is taken out in one flight. In flight the last case needs a live monitor,
+       and an IMU that the monitor finds OK goes back at once if all that are in use are
+       bad. On the ground the IMU stays out until the monitor finds it OK. An IMU that
+       was out when the autopilot started has no notch filters: only the operator or rule
+       4 puts it back.
     2. In flight, the worst bad IMU to which `objection` has nothing becomes held. At
        most ``limit`` IMUs are ours, without a limit all but one.
     3. Orders are sent until the autopilot reports the wanted state. An order to take an
@@ -88,6 +89,7 @@ class Condition(Enum):
     OUT = "out of use by our order, armed"
     STAYS_OUT = "out of use by our order on the ground, because it is still named"
     NOT_OK = "out of use by our order on the ground, not named and not found OK"
+    UNTURNED = "as before, and found OK, but not seen to agree while turning"
     REBOOT = (
         "on the ground, was out of use when the autopilot started: no notch filters"
     )
@@ -95,7 +97,7 @@ class Condition(Enum):
     LEFT_ALONE = "set by somebody else in this flight, or put back by the operator"
     UNUSED = "out of use, and not by our order"
     APART = "apart for long, while two others agree"
-    DISAGREE = "an IMU is apart for long, armed, and the monitor finds none OK"
+    DISAGREE = "an IMU in use is apart for long, armed, and the monitor finds none OK"
     ALONE = "one IMU is alive, or none but samples arrive, armed"
     REDUNDANT = "two or more IMUs in use that agree, and EKF lanes that are not lost"
     LAST_IMU = "one IMU in use, or none, because of our orders"
@@ -132,7 +134,8 @@ class Imu(NamedTuple):
     judged: bool = True  #: The monitor judges at least one of its channels.
     size: float = float("nan")
     """Largest raw difference to the nearest IMU of late, rad/s. NaN: unknown."""
-    #: Not apart from a sound IMU since this time. None: apart, stuck or unknown.
+    #: Not apart from a sound IMU since this time. None: apart, stuck or unknown. If the
+    #: monitor doubts it, or it is out of use, from the time at which the sound one turned.
     agreed: int | None = None
 
 
@@ -426,7 +429,7 @@ def _release(
     only_bad = all(memory.ours or is_bad(imu, settings) for memory, imu in pairs)
     for memory, imu in pairs:
         pause = min(PAUSE << max(0, memory.taken - 1), LONGEST_PAUSE)
-        agrees = imu.agreed is not None and now - imu.agreed >= pause
+        agrees = _has_stood(imu.agreed, pause, now)
         may = view.monitored if view.armed else imu.ok
         heals = agrees and may and is_alive(imu)
         is_better = only_bad and view.monitored and imu.ok and is_alive(imu)
@@ -489,6 +492,10 @@ def _conditions(
         for k, memory in enumerate(memories)
     ]
     is_heard = any(imu.delivers for imu in view.imus)
+    differs = any(
+        is_long and memory.seen is not False
+        for memory, is_long in zip(memories, longest, strict=True)
+    )
     alive = sum(not _has_stood(memory.dead_since, REACTION, now) for memory in memories)
     left = sum(memory.seen is not False for memory in memories)
     lanes = sum(memory.lane_angle < LOST_LANE for memory in memories)
@@ -497,7 +504,7 @@ def _conditions(
         (view.armed and is_heard and alive <= 1, Condition.ALONE),
         (view.armed and by_us and left <= 1, Condition.LAST_IMU),
         (view.armed and lanes <= 1, Condition.LAST_LANE),
-        (view.armed and any(longest) and not is_any_ok, Condition.DISAGREE),
+        (view.armed and differs and not is_any_ok, Condition.DISAGREE),
     )
     found.append((VEHICLE, _first(checks, Condition.REDUNDANT)))
     return found
@@ -526,6 +533,7 @@ def _condition(
         (is_out and not view.armed and memory.without_notch, Condition.REBOOT),
         (is_out and not view.armed and imu.named is True, Condition.STAYS_OUT),
         (is_out and not view.armed and not imu.ok, Condition.NOT_OK),
+        (is_out and not view.armed and memory.held, Condition.UNTURNED),
         (is_out, Condition.OUT),
         (memory.left_alone, Condition.LEFT_ALONE),
         (memory.seen is False, Condition.UNUSED),

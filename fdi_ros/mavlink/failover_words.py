@@ -25,6 +25,7 @@ WORDS = {
     Condition.OUT: Words(CRITICAL, "out of use"),
     Condition.STAYS_OUT: Words(CRITICAL, "still faulty, stays out of use"),
     Condition.NOT_OK: Words(WARNING, "stays out, monitor finds it not OK"),
+    Condition.UNTURNED: Words(WARNING, "stays out until turned by hand"),
     Condition.REBOOT: Words(CRITICAL, "no notch: set INS_USE{} 1 and reboot"),
     Condition.STUCK_OUT: Words(WARNING, "not back in use: no answer"),
     Condition.LEFT_ALONE: Words(WARNING, "left alone until disarmed"),

@@ -10,6 +10,7 @@ ArduPilot are in use.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import struct
@@ -167,7 +168,9 @@ class AutopilotNode(CheckedNode):
             params["failover_file"] or os.environ.get("ROS_HOME", "~/.ros")
         ).expanduser()
         if not params["failover_file"]:
-            path.mkdir(parents=True, exist_ok=True)
+            # Without the folder the file is not usable, and failover says so.
+            with contextlib.suppress(OSError):
+                path.mkdir(parents=True, exist_ok=True)
             path /= f"{self.get_fully_qualified_name().strip('/').replace('/', '_')}_failover.json"
         declarations = f"/{self._monitor}/{INTEGRITY.topic.name.rpartition('/')[2]}"
         kind = message_class(INTEGRITY.topic.type)

@@ -5,7 +5,9 @@
 
 import copy
 import copyreg
+import errno
 import json
+import os
 import struct
 import threading
 import time
@@ -17,7 +19,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink import failover_file
 from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
 from fdi_ros.mavlink.failover_file import FailoverFile
@@ -438,6 +439,35 @@ def test_samples_that_a_link_has_kept_are_no_boot(flying: Monitored) -> None:
     assert not any("notch" in text for text in flying.texts)
 
 
+def test_reports_from_before_an_order_that_come_late_are_no_reports(
+    flying: Monitored,
+) -> None:
+    """The answer to an order is lost, and the way down gets 2.5 s long, for 4 s."""
+    send = flying._travel
+    late = 5 * NS // 2
+    until = 0
+
+    def travel(to, data, peer) -> None:
+        nonlocal until
+        if flying.sent["PARAM_SET"] and not until:
+            until = flying.now + 4 * NS
+            flying._under_way = [
+                (at + late if number < 0 else at, order, number, peer, data)
+                for at, order, number, peer, data in flying._under_way
+            ]
+        waits = max(0, min(late, until + late - flying.now)) if until else 0
+        flying.latency = lambda: 3 * MS + (waits if to is None else 0)
+        if to is not None or not 0 <= flying.now - until + 4 * NS <= 10 * MS:
+            send(to, data, peer)
+
+    flying._travel = travel
+    flying.fault(2, 0.6, seconds=10.0)
+    assert flying.in_use == [True, False, True]
+    assert not any("left alone" in text for text in flying.texts)
+    flying.heal(2, 8.0)
+    assert flying.in_use == [True] * 3
+
+
 def test_an_imu_that_is_dead_with_its_accelerometer_is_out(flying: Monitored) -> None:
     """A message of zeros: of a unit that has delivered it is a sample."""
     autopilot = flying.autopilots[0]
@@ -680,6 +710,43 @@ def test_a_gyro_that_is_still_faulty_stays_out_and_is_announced(
     assert flying.in_use == [True] * 3
 
 
+def test_after_landing_an_imu_stays_out_until_it_has_agreed_while_turning(
+    flying: Monitored,
+) -> None:
+    """At rest a gyro that has lost its scale agrees, and the monitor finds it OK."""
+    autopilot = flying.autopilots[0]
+    turning = autopilot.motion
+    rests = False
+
+    def scaled(t: float) -> np.ndarray:
+        rates = turning(t)
+        if rests:
+            rates -= rates.mean(axis=0)
+        rates[1] *= scale
+        return rates
+
+    autopilot.motion = scaled
+    scale = 0.3
+    flying.fault(2, 0.0, [AMBIGUOUS] * 3, seconds=3.0)
+    assert flying.in_use == [True, False, True]
+    rests = True
+    autopilot.armed = False
+    flying.heal(2, 20.0)
+    assert flying.in_use == [True, False, True]
+    assert flying.texts[-1] == "IMU 2 stays out until turned by hand"
+    assert "out of use: IMU 2" in flying.failover.status(flying.now)[1]
+    assert flying.failover.is_done, "nothing to wait for at a stop"
+    autopilot.armed = True
+    flying.run(5.0)
+    assert flying.in_use == [True, False, True]
+    rests = False
+    flying.run(5.0)
+    assert flying.in_use == [True, False, True], "turned, and it does not agree"
+    scale = 1.0
+    flying.run(5.0)
+    assert flying.in_use == [True] * 3
+
+
 def started_anew(flying: Monitored, path: Path) -> Monitored:
     """The companion dies in flight, the autopilot is started anew with IMU 1 out of use."""
     autopilot = flying.autopilots[0]
@@ -907,13 +974,44 @@ def test_a_file_that_cannot_be_written_in_flight_is_announced_and_written_later(
         "[" * 4000,
     ],
 )
-def test_a_file_that_is_none_of_ours_is_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / "out.json").write_text(text)
-    with pytest.raises(ConfigError, match="does not list"):
-        Monitored(tmp_path, Autopilot("ardupilot"))
-    (tmp_path / "out.json").chmod(0o666)
-    with pytest.raises(ConfigError, match="others can write it"):
-        Monitored(tmp_path, Autopilot("ardupilot"))
+def test_a_file_that_is_none_of_ours_is_not_believed(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "out.json"
+    file.write_text(text)
+    talk = Monitored(tmp_path, Autopilot("ardupilot"))
+    assert "does not list" in talk.vehicle.events[-1]
+    file.chmod(0o666)
+    talk = Monitored(tmp_path, Autopilot("ardupilot"))
+    assert "others can write it" in talk.vehicle.events[-1]
+    talk.run(10.0)
+    assert kept(talk, tmp_path, ()) == (1, [])
+
+
+def test_a_full_disk_at_a_start_in_flight_ends_nothing(
+    flying: Monitored, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The companion starts anew with IMU 1 out of use: it is put back all the same."""
+    autopilot = flying.autopilots[0]
+    flying.fault(1, 0.3, seconds=1.0)
+    flying.failover.close()
+    whole = failover_file.replacing
+
+    def full(path: Path):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(failover_file, "replacing", full)
+    boot, start = autopilot.boot, autopilot.start
+    again = Monitored(tmp_path, autopilot)
+    again.now, autopilot.boot, autopilot.start = flying.now, boot, start
+    assert "No space left on device" in again.vehicle.events[0]
+    again.fault(1, 0.3, seconds=8.0)
+    assert again.in_use == [False, True, True]
+    assert reason(again).startswith("out of use: IMU 1 of system 1")
+    again.heal(1, 8.0)
+    assert again.in_use == [True] * 3
+    assert reason(again) == "no failover: failover_file is not usable"
+    monkeypatch.setattr(failover_file, "replacing", whole)
+    assert until(again, lambda: reason(again) == "ready")
+    assert kept(again, tmp_path, ())[1] == []
 
 
 def test_a_trade_needs_a_reserve(tmp_path: Path) -> None:

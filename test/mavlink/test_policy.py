@@ -14,6 +14,7 @@ from fdi_ros.mavlink.failover_policy import (
     PAUSE,
     QUICK_TRIES,
     STALE_ANSWER,
+    VEHICLE,
     Condition,
     Imu,
     Memory,
@@ -64,11 +65,12 @@ def test_a_late_answer_to_a_read_is_nobodys_hand_and_a_later_one_is():
     assert reported(OUT, begin, begin + LASTING + 40 * MS).left_alone
 
 
-def on_the_ground(memory, now, *, named=False, use=False, boots=0):
+def on_the_ground(memory, now, *, named=False, use=False, boots=0, turned=True):
     """Decision about the first of three IMUs, which has agreed for long, disarmed."""
     imu = Imu(use, now, named=named, ok=named is False, delivers=True, size=0.0)
-    first = imu._replace(agreed=START - 10**12)
-    other = first._replace(use=True)
+    agreed = START - 10**12
+    first = imu._replace(agreed=agreed if turned else None)
+    other = imu._replace(use=True, agreed=agreed)
     view = View(
         (first, other, other),
         linked=True,
@@ -90,6 +92,25 @@ def test_on_the_ground_an_imu_goes_back_only_where_the_monitor_reports_no_fault(
     decision = on_the_ground(OUT, START + 60 * 1000 * MS, named=named)
     assert [order.use for order in decision.orders] == ([] if condition else [True])
     assert condition is None or (0, condition) in decision.words
+
+
+def test_on_the_ground_an_imu_stays_out_until_it_has_agreed_while_turning():
+    decision = on_the_ground(OUT, START + 60 * 1000 * MS, turned=False)
+    assert not decision.orders
+    assert (0, Condition.UNTURNED) in decision.words
+
+
+@pytest.mark.parametrize("is_out", [True, False])
+def test_an_imu_that_is_out_of_use_does_not_disagree(is_out):
+    """The monitor finds none OK, as over a lossy link: the two in use agree."""
+    now = START + 10_000 * MS
+    bad = Imu(not is_out, now, named=True, blamed=True, delivers=True, size=0.5)
+    other = Imu(True, now, delivers=True, size=0.0, agreed=START)
+    view = View((bad, other, other), linked=True, armed=True, monitored=True)
+    memory = replace(OUT, apart_since=START) if is_out else Memory(apart_since=START)
+    memories = (memory, Memory(seen=True), Memory(seen=True))
+    words = decide(PolicyState(memories, at=now), view, now, PolicySettings()).words
+    assert ((VEHICLE, Condition.DISAGREE) in words) is not is_out
 
 
 def test_a_boot_begins_anew_with_orders_that_were_not_answered():
