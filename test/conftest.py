@@ -4,6 +4,7 @@
 """What all tests share: the ROS environment, hypothesis without deadlines, the recording and the bundled bag."""
 
 import fcntl
+import gc
 import os
 import shutil
 import subprocess
@@ -16,7 +17,19 @@ import pytest
 from hypothesis import settings
 
 ROOT = Path(__file__).parents[1]
-LONGEST = ("test_package.py", "test_storm.py", "test_readme.py", "test_bench.py")
+#: Files whose tests mostly wait for processes that they start, the longest first.
+WAITING = (
+    "test_own_node.py",
+    "test_node.py",
+    "test_bench.py",
+    "test_mavlink.py",
+    "test_package.py",
+    "test_montecarlo.py",
+    "test_readme.py",
+    "test_storm.py",
+    "test_watch.py",
+    "test_accelerometer_array.py",
+)
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
 
 
@@ -68,8 +81,39 @@ def pytest_unconfigure():
 
 
 def pytest_collection_modifyitems(items):
-    """Begin with what takes longest, so that at the end no process is left alone with it."""
-    items.sort(key=lambda item: item.path.name not in LONGEST)
+    """Begin with the tests that wait, in every second process: the others compute meanwhile.
+
+    The scheduler gives each process an equal share of consecutive tests, and moves tests
+    from the end of a share to a process that has done its own.
+    """
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    waiters = (workers + 1) // 2
+    waiting = [[] for _ in range(waiters)]
+    others = []
+    for item in items:
+        name = item.path.name
+        if name in WAITING:
+            waiting[WAITING.index(name) % waiters].append(item)
+        else:
+            others.append(item)
+    for part in waiting:
+        part.sort(key=lambda item: WAITING.index(item.path.name))
+    left = len(items)
+    items.clear()
+    for worker in range(workers):
+        share = left // (workers - worker)
+        left -= share
+        begin = waiting[worker // 2] if worker % 2 == 0 else []
+        count = max(0, share - len(begin))
+        items += begin + others[:count]
+        del others[:count]
+    items += others
+
+
+def pytest_collection_finish():
+    """Let the garbage collector pass over modules and tests, which stay until the end."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

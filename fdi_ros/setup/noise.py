@@ -24,6 +24,9 @@ from fdi_ros.model.samples import Array, Int, Mask
 
 #: variance of a channel without noise, (rad/s)^2
 LEAST_VARIANCE = LEAST_NOISE**2
+#: smallest eigenvalue of the information on the rate, relative to the largest, that is
+#: more than rounding
+SINGULAR = 1e-15
 #: windows on both sides that the noise of the moment is averaged over: 5 s, in which
 #: vibration stays
 MEMORY = 2
@@ -53,10 +56,13 @@ def information(variance: Array, axes: Array) -> Array:
     """
     weight = 1.0 / variance
     weighted = weight[..., :, None] * axes
-    normal = np.swapaxes(axes, -1, -2) @ weighted
+    values, vectors = np.linalg.eigh(np.swapaxes(axes, -1, -2) @ weighted)
     # Absent channels may leave no rate, and then no information.
-    solved = np.linalg.pinv(normal, hermitian=True) @ np.swapaxes(weighted, -1, -2)
-    return np.asarray(weight[..., :, None] * np.eye(len(axes)) - weighted @ solved)
+    known = values > SINGULAR * values[..., -1:]
+    inverse = np.divide(1.0, values, out=np.zeros_like(values), where=known)
+    of_rate = weighted @ vectors
+    explained = (of_rate * inverse[..., None, :]) @ np.swapaxes(of_rate, -1, -2)
+    return np.asarray(weight[..., :, None] * np.eye(len(axes)) - explained)
 
 
 def gains(variance: Array, axes: Array) -> Array:
@@ -75,7 +81,8 @@ def variances(covariance: Array, axes: Array) -> Array:
     v = np.repeat(np.maximum(start, LEAST_VARIANCE)[:, None], len(axes), axis=1)
     for _ in range(25):
         a = information(v, axes)
-        t = np.einsum("wij,wjk,wki->wi", a, covariance, a, optimize=True)
+        # The diagonal of A S A, and A is symmetric.
+        t = ((a @ covariance) * a).sum(axis=2)
         checked = np.einsum("wii->wi", a) * v
         ratio = np.where(checked > 1e-6, t * v / np.maximum(checked, 1e-6), 1.0)
         v = v * np.clip(ratio, 0.1, 10.0)
