@@ -525,7 +525,7 @@ class AccelerometersConfig:
         (0.01,), "standard deviation of the scale factor", "", 0.0, 1.0
     )
     bias_walk: tuple[float, ...] = _per_accelerometer(
-        (0.0075,),
+        (0.006,),
         "random walk of the bias of an accelerometer in flight",
         "m/s^2/sqrt(s)",
         0.0,

@@ -235,7 +235,7 @@ def add_noise(
         inference.covariance[i, i] += (
             noise + kf.peak_extra[i] * part + nonlinear_error * nonlinear_error
         )
-        inference.covariance[i, i] += kf.displaced[i] * part + moved
+        inference.covariance[i, i] += moved
         place = params.layout.delays[params.unit[i]]
         if place >= 0:
             swing = moves * kf.peak_turn[i] * part

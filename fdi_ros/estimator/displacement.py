@@ -20,6 +20,9 @@ from fdi_ros.model.samples import Array
 
 # variance by unknown positions over that of the noise, from which it counts at once
 DISPLACED = 0.1
+EDGES = 3.0
+"""Blocks of motion by which a mean of the gyros and one of the accelerometers may differ at
+their ends: filters and sampling instants are not the same."""
 
 
 @compiled
@@ -110,6 +113,9 @@ def add_displacement_of_mean(
         for b in range(3):
             kf.turned[a, b] = (kf.total.turned[a, b] - before.turned[a, b]) / size
     add_displacement(params, kf, kf.turned, kf.spin_change, covariance)
+    edges = min(1.0, EDGES * params.length / size)
+    for i in range(params.sensors.n):
+        covariance[i, i] += kf.displaced[i] * edges * edges
 
 
 @compiled

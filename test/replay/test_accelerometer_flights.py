@@ -80,17 +80,18 @@ def test_vibration_that_one_accelerometer_rectifies_at_take_off_declares_nothing
 
 @in_logs
 @pytest.mark.parametrize(
-    ("log", "channel", "start"),
+    ("log", "channel", "start", "size"),
     [
-        ("quad_20mm_cut_straight", "imu_3.accel_y", 52),
-        ("quad_5mm_cut_hover", "imu_1.accel_y", 37),
+        ("quad_20mm_cut_straight", "imu_3.accel_y", 52, 0.5),
+        ("quad_5mm_cut_hover", "imu_1.accel_y", 37, 0.5),
+        ("quad_25mm_cut_hover", "imu_2.accel_y", 39, 0.3),
     ],
 )
 def test_a_bias_is_named_in_hover_that_shakes_units_whose_positions_are_not_known(
-    log, channel, start
+    log, channel, start, size
 ):
-    """Of 0.5 m/s^2: what the turns to and fro add by 5 cm is as large, and leaves little in a mean."""
-    fault = f"channel={channel} kind=bias size=0.5 start={start}"
+    """What the turns to and fro add by 5 cm is as large, and leaves little in a mean."""
+    fault = f"channel={channel} kind=bias size={size} start={start}"
     summary = replay(LOGS / f"{log}.bin", None, [fault])
     (outcome,) = summary.scores.faults
     assert (outcome.outcome, outcome.channels) == ("named", (channel,))
