@@ -55,6 +55,9 @@ def fdi() -> int:
             # number, and with it all printed text.
             os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
             setattr(sys, name, open(descriptor, "w", encoding="utf-8", closefd=False))  # noqa: SIM115, until the end
+    # The matrices are small: threads of a linear algebra library wait for each other
+    # longer than they compute.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from fdi_ros.cli.command_line import main
 
     try:
