@@ -136,11 +136,11 @@ def assumed_config(path: Path) -> AssumedConfig:
         )
     low = min(config.noise.noise_std)
     high = max(config.noise.noise_std)
-    copies = f"{found.look}; " if found.look else ""
+    look = f"; {found.look}" if found.look else ""
     words = (
-        f"{copies}{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz,"
+        f"{', '.join(config.imus.names)} mounted alike, {config.sample_rate:g} Hz,"
         f" noise {figures(low, 2)} to {figures(high, 2)} rad/s,"
-        f" scale factors within {100 * config.noise.scale_std[0]:g} %; `fdi setup` measures these"
+        f" scale factors within {100 * config.noise.scale_std[0]:g} %; `fdi setup` measures these{look}"
     )
     return AssumedConfig(config, words, found.unused)
 

@@ -465,7 +465,7 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
 
 def burst_words(report: TopicReport) -> str:
     """Words for stamps that come in bursts."""
-    return f"stamps come in bursts of about {report.burst}, not when it measured"
+    return f"its stamps come in bursts of about {report.burst}, and do not show when it measured"
 
 
 def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:

@@ -300,7 +300,7 @@ def _rate_concerns(rate: RateHealth | None) -> list[Concern]:
         return []
     word = Word.CANNOT_TELL if rate.share < LEAST_CHECKED else Word.LOOK
     since = rate.missing_from_s
-    when = "" if since is None else f", first at {since:.1f} s"
+    when = "" if since is None else f", for the first time at {since:.1f} s"
     words = f"was not published for {figures(rate.missing_s)} s{when}"
     return [Concern(word, ("the fused rate",), words)]
 

@@ -34,7 +34,8 @@ from fdi_ros.model.noise import assumption_words
 from fdi_ros.model.quantity import RATE, Quantity
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
-from fdi_ros.system.text import plus_minus
+from fdi_ros.monitor.soundness import short_names
+from fdi_ros.system.text import listed, plus_minus
 
 # standard deviations from which two channels of a larger set surely differ
 CERTAIN = 4.0
@@ -381,11 +382,11 @@ def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
     isolable[mask] = method.isolable
     limits = (
         (mask & ~detectable, "not be seen"),
-        (detectable & ~isolable, "be seen but not isolated"),
+        (detectable & ~isolable, "be seen, but not isolated"),
     )
     names = detector.geometry.channel_names
     notes = [
-        f"a fault of {', '.join(_named(names, marked))} would {words}"
+        f"a fault of {listed(short_names(_named(names, marked)), 'or')} would {words}"
         for marked, words in limits
         if marked.any()
     ]

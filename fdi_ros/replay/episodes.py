@@ -504,7 +504,7 @@ def _evidence(one: Episode) -> str:
     """Describe the evidence for a declaration."""
     words = [one.evidence.reason] if one.evidence.reason else []
     if one.evidence.ratio is not None:
-        words.append(f"statistic {figures(one.evidence.ratio)} times its threshold")
+        words.append(f"statistic {one.evidence.ratio:.2f} times its threshold")
     if (
         one.state == "AMBIGUOUS"
         and one.evidence.last_alarm_s is not None
@@ -529,7 +529,7 @@ def _rivals(one: Episode, unit: Unit) -> str:
         for candidate in one.candidates
     ]
     return "; or ".join(
-        f"{name} wrong by {words}" if words else name for name, words in sizes
+        f"an error of {name}{f', {words}' if words else ''}" for name, words in sizes
     )
 
 

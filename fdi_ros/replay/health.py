@@ -94,10 +94,11 @@ class Deliveries:
         counts = self._counts[:, :length].astype(np.float64)
         # Mean number of messages of each topic, in windows with messages.
         usual_count = counts.sum(axis=1) / np.maximum((counts > 0).sum(axis=1), 1)
+        fewest = usual_count[usual_count > 0].min(initial=MESSAGES_IN_WINDOW)
         together = 1
         while (
             length // together > 2 * LEAST_SLOW
-            and usual_count.min() * together < MESSAGES_IN_WINDOW
+            and fewest * together < MESSAGES_IN_WINDOW
         ):
             together *= 2
         width = self._width * together
@@ -123,8 +124,10 @@ def _delivery(shares: Array, times: Array, width: float, rate: float) -> Deliver
     ``shares`` (k,) of its usual rate in windows that begin at ``times`` (k,) s and last
     ``width`` s. ``rate``: its usual rate, Hz.
     """
+    if not shares.any():
+        return Delivery(0.0, None)
     # The first window is incomplete.
-    begun = int(np.flatnonzero(shares > 0)[0]) + 1
+    begun = int(np.argmax(shares > 0)) + 1
     shares = shares[begun:]
     times = times[begun:]
     if not len(shares):

@@ -257,7 +257,7 @@ def _size_words(size: Size, unit: Unit) -> str:
     if abs(size.rad_s) <= size.std_rad_s and size.course == "steady":
         return ""
     if size.course == "gone":
-        return f"was off by {value} {unit.name} until {size.gone_s:.1f} s only"
+        return f"was off by {value} {unit.name} until {size.gone_s:.1f} s"
     if size.course in ("growing", "shrinking"):
         last = _rate(size.last_rad_s, size.std_rad_s, unit)
         return f"is off by {value}, {size.course} to {last} {unit.name}"

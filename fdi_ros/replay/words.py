@@ -72,7 +72,7 @@ def _concern_lines(summary: Summary) -> list[str]:
     word = verdict_of(summary).word
     deciding = [one for one in summary.concerns if one.word.value == word]
     others = [one for one in summary.concerns if one not in deciding[:MOST_CONCERNS]]
-    return [f"{one}." for one in others]
+    return [f"{str(one).replace('the fused', 'The fused', 1)}." for one in others]
 
 
 def _name_lines(summary: Summary) -> list[str]:
@@ -97,10 +97,10 @@ def unchecked_words(channels: Sequence[ChannelResult]) -> str:
         if not since[-1]:
             when = "from the start"
         elif len(since) > 1:
-            when = f"from {since[0]:.3f} to {since[-1]:.3f} s on"
+            when = f"since {since[-1]:.3f} s at the latest"
         else:
-            when = f"from {since[0]:.3f} s on"
-        names = ", ".join(one.name for one in group)
+            when = f"since {since[0]:.3f} s"
+        names = listed(short_names([one.name for one in group]))
         words.append(f"{names} {state} {when}{f' ({reason})' if reason else ''}")
     return "; ".join(words)
 
@@ -131,14 +131,14 @@ def notes(summary: Summary) -> list[str]:
         )
     for topic, counters in stream.alignment.items():
         odd = ", ".join(
-            f"{ODD.get(name, name)}: {n}"
+            f"{ODD.get(name, f'samples {name}')}: {n}"
             for name, n in counters.items()
             if n and name != "received"
         )
         lines += [f"{topic}: {odd}"] if odd else []
     if missing := scores.samples - scores.samples_with_rate:
         bias = summary.monitor.bias.state
-        lines.append(f"{missing} samples without a fused rate (start-up bias: {bias})")
+        lines.append(f"no fused rate in {missing} samples (start-up bias: {bias})")
     lines += stretch_words(summary.story)
     return [*lines, summary.monitor.note] if summary.monitor.note else lines
 
@@ -239,6 +239,7 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
         (one, [each for each in channels if each.unit == one.name] or list(channels))
         for one in units
     ]
+    delay = f"delay to {units[0].name}" if units else "delay"
     columns: dict[str, Callable[[Any], str]] = {
         "unit": lambda row: row[0].name,
         "delivered": lambda row: f"{100 * row[0].delivered:.0f} %",
@@ -251,11 +252,11 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
         f"noise, {unit.name}": lambda row: number(_noise(row[1], unit), ".2g"),
         f"noise, {FORCES.name}": lambda row: number(_noise(row[1], FORCES), ".2g"),
         "temperature": lambda row: _temperature_words(row[0]),
-        "delay": lambda row: milliseconds(row[0].delay_s),
+        delay: lambda row: milliseconds(row[0].delay_s),
         "trouble": lambda row: _trouble_words(summary, row[0].name, row[1]),
     }
     if all(one.delay_s is None for one in units):
-        del columns["delay"]
+        del columns[delay]
     if all(one.temperature_c is None for one in units):
         del columns["temperature"]
     if all(one.measured_in != FORCES.name for one in channels):
@@ -397,6 +398,6 @@ def _folded(story: Story) -> tuple[list[Episode], list[str]]:
         begin = some[0].start_s
         end = max(one.end_s for one in some)
         words.append(
-            f"{len(some)} times between {begin:.1f} and {end:.1f} s STALE: {who} ({why})"
+            f"STALE {len(some)} times between {begin:.1f} and {end:.1f} s: {who} ({why})"
         )
     return [one for some in alike.values() for one in some], words

@@ -85,9 +85,7 @@ def test_stamps_in_bursts_have_the_rate_of_the_whole_and_their_unit_is_left_out(
     write_mcap(tmp_path / "bag.mcap", messages)
     settings = tmp_path / "settings.yaml"
     inspected = fdi("inspect", tmp_path / "bag.mcap", "--output", settings).out
-    words = (
-        f"/imu_1/data is left out: stamps come in bursts of about {size}, not when it"
-    )
+    words = f"/imu_1/data is left out: its stamps come in bursts of about {size}, and do not show when it"
     assert words in inspected
     assert "sample_rate: 50.0" in settings.read_text()
     replayed = fdi("replay", tmp_path / "bag.mcap")
