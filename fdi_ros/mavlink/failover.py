@@ -175,14 +175,14 @@ class Failover:
         )
 
     def restore(self, now: int) -> tuple[bool, str]:
-        """Put all IMUs back. Return whether the autopilot was asked, and an answer."""
+        """Ask to put all IMUs back. Return whether that was done, and an answer."""
         ours = ", ".join(imu_name(imu, self._channels) for imu in self.out)
         if not ours:
             return True, "no IMU is out of use by failover"
         if not self._view(now).linked:
             return False, f"{ours} cannot be put back: the autopilot is not heard"
         self.turn(now, restore=True)
-        return True, f"{ours} is put back"
+        return True, f"the autopilot is asked to use {ours} again"
 
     def status(self, now: int) -> tuple[Level, str]:
         """Return level and words for the diagnostics."""

@@ -816,7 +816,10 @@ def test_a_new_start_of_the_node_needs_no_right_unix_time(
 
 def test_an_operator_puts_back(flying: Monitored) -> None:
     flying.fault(1, 0.3, seconds=1.0)
-    assert flying.failover.restore(flying.now) == (True, "IMU 1 is put back")
+    assert flying.failover.restore(flying.now) == (
+        True,
+        "the autopilot is asked to use IMU 1 again",
+    )
     flying.run(5.0)
     assert flying.in_use == [True] * 3
     answer = flying.failover.restore(flying.now)

@@ -138,7 +138,8 @@ def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(
         assert wait(lambda: any(text.startswith(told) for _, text in autopilot.texts))
         assert ears.says("failover", "out of use: IMU 1 of system 1")
         assert (
-            ears.call(Trigger, "/mavlink_node/restore").message == "IMU 1 is put back"
+            ears.call(Trigger, "/mavlink_node/restore").message
+            == "the autopilot is asked to use IMU 1 again"
         )
         assert wait(lambda: autopilot.flies_with == 0)
         assert {(name, value) for _, name, value in autopilot.sets} == {
