@@ -191,9 +191,13 @@ class RawComparison:
         change = rates[-ENDS:].mean(axis=0) - rates[:ENDS].mean(axis=0)
         return bool(np.linalg.norm(change) > MOVED + NOISE * noise)
 
+    def _rates(self, unit: int) -> list[Vector]:
+        """Return the rates of an IMU within `AVERAGED`, rad/s."""
+        return list(self._recent[unit])[-self._averaged :]
+
     def rate(self, unit: int) -> float:
         """Return the largest rate of an IMU within `AVERAGED`, rad/s."""
-        rates = list(self._recent[unit])[-self._averaged :]
+        rates = self._rates(unit)
         return max(math.hypot(*rate) for rate in rates) if rates else math.nan
 
     def shift(self, unit: int, other: int) -> Vector:
@@ -203,7 +207,7 @@ class RawComparison:
         """
         gains = []
         for k in (unit, other):
-            rates = list(self._recent[k])[-self._averaged :]
+            rates = self._rates(k)
             ends = zip(rates[0], rates[-1], strict=True)
             gains.append([last - first for first, last in ends])
         share = USUAL_SKEW / AVERAGED
@@ -212,7 +216,7 @@ class RawComparison:
 
     def turn(self, unit: int) -> float:
         """Return the mean rate of an IMU within `AVERAGED`, rad/s: that of a turn."""
-        rates = list(self._recent[unit])[-self._averaged :]
+        rates = self._rates(unit)
         return math.hypot(*np.mean(rates, axis=0)) if rates else math.nan
 
     def is_stuck(self, unit: int) -> bool:
