@@ -48,6 +48,7 @@ def check(settings: PathSettings, health: Health, sample: Sample) -> None:
         if stamp - health.received_stamp[i] > settings.stale_time:
             condition = SILENT
         health.condition[i] = condition
+    follow_run_lengths(settings, health, received)
     silence_units(settings, health)
     for i in range(n):
         health.counts[health.condition[i], i] += 1
@@ -86,6 +87,7 @@ def receive(
         change = abs(z - health.value[i])
         if z != health.value[i] or hole:
             health.run_stamp[i] = stamp
+            health.ended[i] = health.repeats[i]
         if change > 0.0 and (change < health.step[i] or health.step[i] == 0.0):
             health.step[i] = change
         follow_rail(settings, health, i, z)
@@ -99,6 +101,41 @@ def receive(
         if stamp - health.bad_stamp[i] >= settings.non_finite_time
         else NON_FINITE
     )
+
+
+RUN_GAIN, RUN_MEMORY = 1.0 / 16.0, 1.0 / 512.0
+"""Shares of the length of a run in the usual length, where it is longer and shorter."""
+#: Longest run that counts in the usual length: one defect is no habit.
+LONGEST_RUN = 16.0
+
+
+@compiled
+def follow_run_lengths(
+    settings: PathSettings, health: Health, received: NDArray[np.uint8]
+) -> None:
+    """Update the usual length of a run of equal values of each channel whose value has changed.
+
+    Where all channels of a unit change at once, the source has repeated old values, and
+    the run is no habit of the channel.
+    """
+    changed = present = 0
+    for i in range(settings.n):
+        if received[i]:
+            present |= 1 << i
+            if health.run_stamp[i] == health.stamp:
+                changed |= 1 << i
+    for i in range(settings.n):
+        if changed >> i & 1:
+            beside = present
+            for u in range(settings.units):
+                if settings.members[u] >> i & 1:
+                    beside = present & settings.members[u]
+            length = 1.0
+            if beside & ~changed:
+                length = max(min(float(health.ended[i]), LONGEST_RUN), 1.0)
+            usual = max(health.run_length[i], 1.0)
+            gain = RUN_GAIN if length > usual else RUN_MEMORY
+            health.run_length[i] = usual + gain * (length - usual)
 
 
 RANGES = tuple(

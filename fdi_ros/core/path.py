@@ -471,8 +471,10 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
     # channels in doubt from now on.
     now.usable &= ~core.decision.faulty
     now.doubtful = core.decision.suspicion | before | core.decision.ambiguous
-    enough = not changed or subsets[now.usable & ~now.doubtful].spare
-    fuse(core, subsets, now.doubtful if enough else core.decision.ambiguous)
+    outliers = now.evidence.outliers & ~core.decision.faulty
+    if changed and not subsets[now.usable & ~now.doubtful].spare:
+        now.doubtful = core.decision.ambiguous | outliers
+    fuse(core, subsets, now.doubtful)
     # Declarations do not change the states of the estimator.
     if changed and not settings.guard_declares:
         forget(path.method[0], path.method_memory)
@@ -480,7 +482,9 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
     checked = subsets[living].detectable & at_least(
         core.decision, settings, CHECKED, settings.alarms
     )
-    update_states(core, checked, 0 if changed else core.decision.suspicion, False)
+    update_states(
+        core, checked, outliers if changed else core.decision.suspicion, False
+    )
     last.statistic = verdict.statistic
     last.threshold = verdict.threshold
     last.alarm = verdict.alarm

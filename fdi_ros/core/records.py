@@ -288,6 +288,8 @@ class Health:
     limit: Channels  # size from which on a value is out of range, rad/s
     extreme: Channels  # largest size of a value so far, rad/s
     repeats: Counts  # number of times the last value has come in a row
+    ended: Counts  # the same of the value before
+    run_length: Channels  # usual number of equal values in a row
     bad_stamp: Stamps  # start of the present run of non-finite values, ns, or `NOT_BAD`
     condition: Flags  # `Condition` in this sample
     # samples in each condition
@@ -635,6 +637,7 @@ class Current:
     doubt: Vector  # an error of the rate whose square is added to its covariance, rad/s
     shared_error: Axes  # C G', covariance of channel errors with the rate, (rad/s)^2
     prediction: Channels  # of each channel by the others, rad/s, or NaN
+    moved: Channels  # change of each channel since another one repeats its value, rad/s
     variance: Channels  # of noise and other errors of single samples, (rad/s)^2
     uncertainty: Channels  # `variance` plus that of the estimated errors, (rad/s)^2
     parity: Parity
@@ -674,6 +677,9 @@ class Core:
     # or NaN
     reference: Channels
     witnesses: Counts  # channels that the reference of each is predicted from
+    reference_input: (
+        Square  # values of all channels at the time of each reference, rad/s
+    )
     saturated: Flag  # a manoeuvre has driven a channel out of range
     saturated_stamp: Whole  # last sample with a saturated channel, ns
     samples: Whole  # so far

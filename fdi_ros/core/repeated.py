@@ -9,9 +9,11 @@ axis: then the channel is stuck, or the values of a whole unit are old.
 
 A fault at rest looks like motion to every quiet channel beside it. The others are
 therefore evidence of motion only if they agree. The same channels must have seen the
-whole motion, their disagreement must be small beside the motion, and in coarse steps
-each of them must be checked by the rest. An alarm that does not isolate the channel
-that repeats forbids the conclusion too.
+whole motion, and their disagreement must be small beside the motion. The noise of a fine
+sensor never repeats. A channel that repeats values by habit is stuck only if no single
+one of the others can be the cause: without each of them, the rest must have measured the
+motion too. An alarm that does not isolate the channel that repeats forbids the
+conclusion too.
 """
 
 from __future__ import annotations
@@ -41,6 +43,8 @@ MAVLink, rad/s."""
 #: A larger step is coarse, standard deviations. Noise crosses smaller steps with nearly
 #: every sample.
 COARSE_STEP = 0.5
+#: Usual length of a run of equal values from which the noise is smaller than the steps.
+USUAL_RUN = 1.2
 ALL_REPEAT = 100_000_000
 """Time for which all channels may repeat their values, ns: links may delay messages. In
 coarse steps ``stuck_time``, if longer: gyros without noise repeat in a steady turn."""
@@ -96,35 +100,43 @@ def fill_disagreement(
 
 
 @compiled
-def is_confirmed(settings: PathSettings, subset: Subset, mask: int, i: int) -> bool:
-    """Return whether each channel of a mask that measures along channel i is checked.
+def is_confirmed(
+    core: Core, subsets: NDArray[Any], others: int, i: int, least: float
+) -> bool:
+    """Return whether the others have measured motion along channel i, whichever of them is left out.
 
-    ``subset`` is that of the mask.
+    Each must have measured more than ``least``, rad/s, since channel i first had its value.
     """
-    axes = settings.sensors.axes
-    for j in range(settings.n):
-        unchecked = mask & ~subset.detectable & (1 << j)
-        if unchecked and abs(along(axes[i], axes[j])) > MIN_SENSITIVITY:
-            return False
+    now = core.now
+    axes = core.settings.sensors.axes
+    n = core.settings.n
+    for j in range(n):
+        if others >> j & 1 and abs(along(axes[i], axes[j])) > MIN_SENSITIVITY:
+            rest = others & ~(1 << j)
+            for k in range(n):
+                now.moved[k] = now.input[k] - core.reference_input[i, k]
+            fill_rate(subsets[rest], n, rest, now.moved, now.others_rate)
+            # Without a rate the comparison is false.
+            if not abs(along(axes[i], now.others_rate)) > least:
+                return False
     return True
 
 
 @compiled
 def has_moved(
-    core: Core, subset: Subset, others: int, i: int, least: float, step: float
+    core: Core, subsets: NDArray[Any], others: int, i: int, least: float, step: float
 ) -> bool:
     """Return whether the others have measured motion along channel i while it repeats.
 
-    ``subset`` is that of the others.
+    ``least`` is the motion beyond one step that noise does not show, rad/s.
     """
     now = core.now
     noise = core.settings.sensors.noise_std[i]
     change = abs(now.prediction[i] - core.reference[i])
     if not (change > least + step and now.disagreement[i] < (AGREED * change) ** 2):
         return False
-    # The noise of a fine sensor never repeats, so its repeated values need no other check.
-    coarse = step > COARSE_STEP * noise
-    return not coarse or is_confirmed(core.settings, subset, others, i)
+    by_habit = core.health.run_length[i] > USUAL_RUN or step > COARSE_STEP * noise
+    return not by_habit or is_confirmed(core, subsets, others, i, least + step)
 
 
 @compiled
@@ -148,6 +160,8 @@ def update_stuck(core: Core, subsets: NDArray[Any], mask: int, stamp: int) -> in
         if core.health.run_stamp[i] == stamp or others != core.witnesses[i]:
             core.reference[i] = now.prediction[i]
             core.witnesses[i] = others
+            for j in range(n):
+                core.reference_input[i, j] = now.input[j]
         elif now.evidence.repeats & now.usable & (1 << i):
             isolated = now.verdict.suspects[i] and now.verdict.isolated
             if now.verdict.alarm and not isolated:
@@ -157,7 +171,7 @@ def update_stuck(core: Core, subsets: NDArray[Any], mask: int, stamp: int) -> in
             spread = math.sqrt(
                 (noise * noise + step * step / 12.0) / (share if share > 0 else 0.5)
             )
-            if has_moved(core, subsets[others], others, i, LEAST_MOTION * spread, step):
+            if has_moved(core, subsets, others, i, LEAST_MOTION * spread, step):
                 stuck |= 1 << i
                 core.health.stuck[i] += 1
     return stuck
@@ -178,7 +192,10 @@ def add_stuck(settings: PathSettings, now: Current, evidence: int) -> None:
 
 @compiled
 def update_repeated(core: Core) -> int:
-    """Return the channels of units that repeat all their values while the others move."""
+    """Return the channels of units that repeat all their values while the others move.
+
+    Where every channel of a unit repeats values by habit, all of them may do so at once.
+    """
     members = core.settings.members
     sensors = core.settings.sensors
     found = 0
@@ -187,8 +204,10 @@ def update_repeated(core: Core) -> int:
         # unit with a declared channel may.
         fresh = members[u] & ~core.now.plain != 0
         moved = False
+        by_habit = True
         for i in range(core.settings.n):
             if members[u] >> i & 1:
+                by_habit = by_habit and core.health.run_length[i] > USUAL_RUN
                 h = sensors.axes[i]
                 change = 0.0
                 for a in range(3):
@@ -201,7 +220,7 @@ def update_repeated(core: Core) -> int:
         if fresh:
             for a in range(3):
                 core.unit_rate[u, a] = core.now.rate[a]
-        elif moved:
+        elif moved and not by_habit:
             found |= members[u]
     return found
 

@@ -374,6 +374,15 @@ def usual_chi(free: float) -> float:
 
 
 @compiled
+def excess_over_usual(chi: float, free: float) -> float:
+    """Return by how much a chi-square exceeds the largest usual one, at least 1.
+
+    One direction of the rate may have all of the excess.
+    """
+    return max(1.0, 1.0 + chi - usual_chi(free))
+
+
+@compiled
 def motion_growth(kf: Estimator, rate: Vector) -> float:
     """Growth of the state uncertainty since the last block, at a rate (3,), rad/s."""
     return max((square(rate) + SLOW_TURN) / (kf.speed_squared + SLOW_TURN), 1.0)
@@ -401,7 +410,7 @@ def update_statistics(params: Constants, kf: Estimator) -> None:
             )
             free += 1.0
         kf.distance[i] = abs(kf.statistic[i]) * math.sqrt(kf.share[i] * kf.inflation[i])
-    kf.odd = max(1.0, chi / usual_chi(free))
+    kf.odd = excess_over_usual(chi, free)
 
 
 @compiled

@@ -20,6 +20,7 @@ from fdi_ros.estimator.estimator import (
     Constants,
     Estimator,
     correct_sample,
+    excess_over_usual,
     motion_growth,
     usual_chi,
 )
@@ -244,7 +245,7 @@ def leave_spike_out(
     free = -3.0
     for i in range(params.sensors.n):
         free += (kf.mask & ~kf.spiked) >> i & 1
-    kf.odd = max(1.0, chi / burst / usual_chi(free))
+    kf.odd = excess_over_usual(chi / burst, free)
     correct_sample(params, kf, values, kf.clean.gain)
     for i in range(params.sensors.n):
         kf.imputed[i] = kf.corrected[i]

@@ -142,6 +142,32 @@ def test_a_value_repeats_because_the_sensor_is_still_and_quantised(
     assert len(z[rows]) or (output.state[4:] == ChannelState.OK).all()
 
 
+@pytest.mark.parametrize("size", [0.1, 1.0])
+@pytest.mark.parametrize("units", [2, 3])
+def test_quiet_values_repeat_beside_a_channel_that_fails_by_noise(units, size):
+    """Steps hide the noise of the others. No healthy channel is stuck, and the covariance is true."""
+    pipeline = Pipeline(
+        parallel(
+            units,
+            **SEQUENTIAL,
+            noise__noise_std=[0.003],
+            health__stuck_time=0.5,
+            health__stuck_time_at_rest=0.0,
+        )
+    )
+    rng = np.random.default_rng(4)
+    stamp = stream(pipeline.geometry, 2500, size=0.0).stamp
+    z = rng.normal(0, 3e-4, (2500, 3 * units)) + rng.normal(0, 0.01, 3 * units)
+    z[1000:, 1] += size * rng.standard_normal(1500)
+    output = pipeline.process(Block(stamp, np.round(z, 3)))
+    assert {name for name, state in declarations(pipeline, output)} <= {"imu_1.y"}
+    after = output.rate[1000:] - output.rate[500:1000].mean(axis=0)
+    nees = np.einsum(
+        "ki,kij,kj->k", after, np.linalg.inv(output.covariance[1000:]), after
+    )
+    assert np.nanmean(nees) / 3 < 2.0
+
+
 @pytest.mark.parametrize("value", [0.0, 0.3])
 def test_all_channels_freeze_and_agree_with_each_other(value):
     pipeline = Pipeline(parallel(2))
