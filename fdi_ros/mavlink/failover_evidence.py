@@ -92,8 +92,6 @@ KEPT = 64  #: Samples kept of each IMU.
 
 UNKNOWN: Vector = (math.nan, math.nan, math.nan)
 NOBODY: tuple[int, set[int], int] = (-1, set(), 0)
-#: Difference of each pair of IMUs, in either order, by axis, rad/s. NaN: unknown.
-Apart = dict[tuple[int, int], Vector]
 
 
 class Difference(NamedTuple):
@@ -108,6 +106,19 @@ class Difference(NamedTuple):
     def size(self) -> float:
         """Largest component, rad/s."""
         return max(map(abs, self.mean))
+
+
+class Compared(NamedTuple):
+    """How far two IMUs are apart now, by axis, rad/s. NaN: unknown."""
+
+    apart: (
+        Vector  #: If steady, or a wild oscillation. 0: what a mean leaves of another.
+    )
+    bound: Vector  #: A bound that two that agree keep: mean, or scatter from `CALM` on.
+    mean: Vector  #: Steady or not.
+
+
+UNCOMPARED = Compared(UNKNOWN, UNKNOWN, UNKNOWN)
 
 
 class RawComparison:
@@ -317,6 +328,14 @@ def _lasts(values: np.ndarray, window: np.ndarray) -> np.ndarray:
     return lasting
 
 
+def _nearest(found: Sequence[Vector]) -> Vector:
+    """Return the smallest of the differences of an IMU to its partners."""
+    # One difference that is unknown may be the one in which the IMU agrees.
+    if not found or any(map(math.isnan, map(max, found))):
+        return UNKNOWN
+    return min(found, key=max)
+
+
 def _steady(values: Sequence[float]) -> float:
     """Return the value nearest to zero, or 0 if the values differ in sign."""
     low = min(values)
@@ -343,12 +362,10 @@ class Evidence:
         self.begun = 0  #: Time from which states have come without a break, ns.
         self.raw = RawComparison(count, interval)
         self.imus: tuple[Imu, ...] = (Imu(),) * count
-        # Difference of each pair, and a bound on it with oscillations.
-        self._apart: Apart = {}
-        self._bound: Apart = {}
-        self._means: Apart = {}  # the mean, steady or not
-        self._compared: dict[tuple[int, int], int] = {}  # when each was last known, ns
-        # The same of each IMU and the nearest other one now, rad/s. NaN: unknown.
+        # Each pair of IMUs, in either order, and when it was last known, ns.
+        self._pairs: dict[tuple[int, int], Compared] = {}
+        self._known_at: dict[tuple[int, int], int] = {}
+        # Difference of each IMU and the nearest other one, and its bound, rad/s.
         self._nearby = [math.nan] * count
         self._bounded = [math.nan] * count
         self._min_size = min_size
@@ -410,21 +427,19 @@ class Evidence:
             self._odd_since = self._odd_seen = now
         if now - self._odd_since < lasting:
             odd = -1
-        partners = {k: self._partners(k, units, out) for k in units}
-        nearest = [
-            self._nearest(k, partners.get(k, []), self._apart)
+        partners = [
+            self._partners(k, units, out) if k in units else []
             for k in range(len(delivers))
         ]
+        pairs = [[self._pairs[k, j] for j in js] for k, js in enumerate(partners)]
+        nearest = [_nearest([pair.apart for pair in row]) for row in pairs]
         self._nearby = [max(vector) for vector in nearest]
-        self._bounded = [
-            max(self._nearest(k, partners.get(k, []), self._bound))
-            for k in range(len(delivers))
-        ]
+        self._bounded = [max(_nearest([pair.bound for pair in row])) for row in pairs]
         held = math.exp(-(now - self._looked) / NS / DECAY)
         self._looked = now
         imus = []
         for k, vector in enumerate(nearest):
-            agreed = self._note_agreement(k, partners.get(k, []), k in out, now)
+            agreed = self._note_agreement(k, partners[k], k in out, now)
             if agreed is None or now - agreed < HEALED:
                 before = [held * size for size in self._sizes[k]]
                 x, y, z = map(max, vector, before)
@@ -457,50 +472,48 @@ class Evidence:
         return self._bounded[unit]
 
     def _compare(self, units: Sequence[int], now: int) -> None:
-        """Note by how much each pair differs, by axis, rad/s, less what scales explain.
-
-        First the steady part of the difference, and a wild oscillation: 0 for what a
-        mean leaves of another one. Then a bound that two that agree keep: the mean, or
-        the scatter from `CALM` on.
-        """
+        """Compare each pair of IMUs."""
         for j, k in combinations(units, 2):
             difference = self.raw.between(j, k, now)
-            if difference is None and now - self._compared.get((j, k), 0) <= BREAK:
+            if difference is not None:
+                self._known_at[j, k] = now
+                found = self._compared(j, k, difference, now)
+            elif now - self._known_at.get((j, k), 0) > BREAK:
+                found = UNCOMPARED
+            else:
                 # Of a lossy link: the last values hold.
                 continue
-            sizes = [math.nan] * 3
-            bound = [math.nan] * 3
-            means = [math.nan] * 3
-            if difference is not None:
-                self._compared[j, k] = now
-                quick = self.raw.steady(j, k, now)
-                scale = SCALE * min(self.raw.rate(j), self.raw.rate(k))
-                shifts = self.raw.shift(j, k)
-                for axis, mean in enumerate(difference.mean):
-                    spread = difference.spread[axis]
-                    size = max(0.0, abs(mean) - scale - shifts[axis])
-                    is_wild = math.hypot(mean, spread) >= WILD + scale
-                    is_steady = difference.steady[axis] or abs(quick[axis]) >= LARGE
-                    means[axis] = size
-                    sizes[axis] = size if is_steady else WILD if is_wild else 0.0
-                    bound[axis] = max(size, spread if spread >= CALM else 0.0)
-            for pair in ((j, k), (k, j)):
-                self._apart[pair] = sizes[0], sizes[1], sizes[2]
-                self._bound[pair] = bound[0], bound[1], bound[2]
-                self._means[pair] = means[0], means[1], means[2]
+            self._pairs[j, k] = self._pairs[k, j] = found
+
+    def _compared(self, j: int, k: int, difference: Difference, now: int) -> Compared:
+        """Return how far two IMUs are apart, less what scales and delays explain."""
+        quick = self.raw.steady(j, k, now)
+        scale = SCALE * min(self.raw.rate(j), self.raw.rate(k))
+        shifts = self.raw.shift(j, k)
+        axes = []
+        for axis, mean in enumerate(difference.mean):
+            spread = difference.spread[axis]
+            size = max(0.0, abs(mean) - scale - shifts[axis])
+            is_wild = math.hypot(mean, spread) >= WILD + scale
+            is_steady = difference.steady[axis] or abs(quick[axis]) >= LARGE
+            apart = size if is_steady else WILD if is_wild else 0.0
+            axes.append((apart, max(size, spread if spread >= CALM else 0.0), size))
+        return Compared(*zip(*axes, strict=True))
 
     def _note_trust(self, units: Sequence[int], now: int) -> None:
         """Note whether all IMUs agree, and which are apart from all others."""
         pairs = list(combinations(units, 2))
         stuck = any(map(self.raw.is_stuck, units))
-        agree = pairs and all(max(self._apart[pair]) < self._min_size for pair in pairs)
+        agree = pairs and all(
+            max(self._pairs[pair].apart) < self._min_size for pair in pairs
+        )
         self._together = (self._together or now) if agree and not stuck else None
         for k in units:
             doubts = self._doubts(k)
             if doubts != self._doubted[k]:
                 self._doubted[k] = doubts
                 self._doubted_at[k] = now
-            own = [max(self._apart[k, j]) for j in units if j != k]
+            own = [max(self._pairs[k, j].apart) for j in units if j != k]
             if self._together is not None and now - self._together >= TRUSTED:
                 is_old = now - self._doubted_at[k] >= REFUTING
                 self._refuted[k] = doubts if is_old else self._refuted[k] or set()
@@ -557,14 +570,6 @@ class Evidence:
         fit = [k for k in others if k not in out or self._refuted[k] is not None]
         return fit or others
 
-    def _nearest(self, unit: int, partners: Sequence[int], apart: Apart) -> Vector:
-        """Return the difference of an IMU to the nearest of its partners."""
-        found = [apart[unit, k] for k in partners]
-        # One difference that is unknown may be the one in which the IMU agrees.
-        if not found or any(map(math.isnan, map(max, found))):
-            return UNKNOWN
-        return min(found, key=max)
-
     def _agree(self, unit: int, other: int, doubted: bool) -> bool:
         """Return whether an IMU agrees with a partner that is sound.
 
@@ -573,7 +578,8 @@ class Evidence:
         is_ok = set(self._states[other]) == {ChannelState.OK}
         is_sound = is_ok or self._nearby[other] < self._min_size
         is_stuck = self.raw.is_stuck(unit) or self.raw.is_stuck(other)
-        sizes = (self._bound if doubted else self._apart)[unit, other]
+        pair = self._pairs[unit, other]
+        sizes = pair.bound if doubted else pair.apart
         return is_sound and not is_stuck and max(sizes) < self._min_size
 
     def _is_contradicted(self, unit: int, partners: Sequence[int]) -> bool:
@@ -582,7 +588,7 @@ class Evidence:
         Two IMUs that fail alike agree with each other, but not with the third.
         """
         return any(
-            max(self._apart[unit, k]) >= self._min_size
+            max(self._pairs[unit, k].apart) >= self._min_size
             and not self._axes(k, ChannelState.FAULTY)
             for k in partners
         )
@@ -596,10 +602,9 @@ class Evidence:
         others = [k for k in units if k != unit]
         if len(others) != 2 or unit not in units:
             return False
-        size = min(max(self._apart[unit, k]) for k in others)
-        if not max(self._means[others[0], others[1]]) < max(
-            self._min_size, ALIKE * size
-        ):
+        size = min(max(self._pairs[unit, k].apart) for k in others)
+        between = max(self._pairs[others[0], others[1]].mean)
+        if not between < max(self._min_size, ALIKE * size):
             return False
         for k in others:
             refuted = self._refuted[k]
@@ -625,7 +630,7 @@ class Evidence:
                 continue
             if axes := self._clear_axes(k, units, now):
                 return k, axes, 0
-            sizes = [self._apart[k, j] for j in units if j != k]
+            sizes = [self._pairs[k, j].apart for j in units if j != k]
             axes = {
                 axis
                 for axis in self._axes(k, ChannelState.AMBIGUOUS)
