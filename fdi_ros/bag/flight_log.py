@@ -54,10 +54,6 @@ FLU = np.array([1.0, -1.0, -1.0])
 _FEWEST = 20
 #: means of a coarse check: the shortest log has few
 _FEWEST_COARSE = 3
-#: share of that rate which is enough, as clocks and loggers are inexact
-_TOLERANCE = 0.95
-_MAX_INTERVAL_RATIO = 1.5
-"""Ratio to the longest expected interval: more is a gap, less may be jitter."""
 #: largest step back of time within one log, us
 _MAX_STEP_BACK = 1_000_000
 #: samples whose median time marks the progress of a log, robust to damaged times
@@ -151,7 +147,8 @@ class Track:
         if not len(stamp):
             return
         steps = np.diff(stamp, prepend=self.last) if self.count else np.diff(stamp)
-        steps = steps[(steps > 0) & (steps <= 1e6 * _MAX_INTERVAL_RATIO / self.slowest)]
+        # A longer interval is a gap, a shorter one may be jitter.
+        steps = steps[(steps > 0) & (steps <= 1e6 * 1.5 / self.slowest)]
         self.fast += len(steps)
         self.fast_time += int(steps.sum())
         self.first = self.first if self.count else int(stamp[0])
@@ -196,7 +193,8 @@ class Track:
     @property
     def fast_enough(self) -> bool:
         """Whether its rate can be judged and is high enough, in bursts at least."""
-        return self.count >= self.fewest and self.rate >= _TOLERANCE * self.slowest
+        # Clocks and loggers are inexact.
+        return self.count >= self.fewest and self.rate >= 0.95 * self.slowest
 
     @property
     def usable(self) -> bool:

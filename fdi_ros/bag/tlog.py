@@ -57,8 +57,6 @@ _TIME = 8
 _LEAST = _TIME + 8
 #: messages beside the rates that are kept: the first ones
 _MOST_BESIDE = 100_000
-_MAX_DELAY_SPREAD = 3_600_000_000
-"""Delay relative to the median at which the time of a message is damaged, us."""
 #: largest time, us
 _LATEST = 1 << 53
 _ROW = struct.Struct("=3q7d")
@@ -261,8 +259,9 @@ def record_end(data: bytes, at: int) -> int:
 def _start_utc_by(starts: Sequence[Int]) -> int | None:
     """Return the UTC of the start of the autopilot by the message with the least delay."""
     ordered = np.sort(np.concatenate([np.empty(0, np.int64), *starts]))
+    # A time that is an hour off is damaged.
     near = (
-        ordered[ordered >= np.median(ordered) - _MAX_DELAY_SPREAD]
+        ordered[ordered >= np.median(ordered) - 3_600_000_000]
         if len(ordered)
         else ordered
     )

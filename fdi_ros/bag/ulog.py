@@ -59,8 +59,6 @@ _SELECTED, _STATUS = "sensor_combined", "vehicle_imu_status"
 _KINDS = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo", _SELECTED, _STATUS)
 _RAW_GYRO, _RAW_FORCE = "sensor_gyro", "sensor_accel"
 """Messages of a gyro, and of an accelerometer, which may be samples of other times."""
-_LONGEST_STEP = 3.0
-"""Longest interval between two samples of an accelerometer that is bridged, in usual ones."""
 _GPS = ("sensor_gps", "vehicle_gps_position")
 _LACKS = "its format lacks a field, or is not that of its samples"
 _WRONG = (
@@ -73,8 +71,6 @@ _WRONG = (
     ValueError,
 )
 """Exceptions of pyulog for a damaged file."""
-#: characters of a serial number that are read
-_LONGEST_ID = 64
 #: us over which PX4 takes the means of vehicle_imu_status
 _MEAN_TIME = 100_000
 _THROTTLE = (
@@ -152,7 +148,7 @@ class Ulog(LibraryLog):
             self.note(
                 f"the logger dropped out {times}, for {sum(dropouts):.3g} s in all and {max(dropouts):.3g} s at most"
             )
-        self.hardware_id = str(log.msg_info_dict.get("sys_uuid", ""))[:_LONGEST_ID]
+        self.hardware_id = str(log.msg_info_dict.get("sys_uuid", ""))[:64]
         for text in log.logged_messages:
             self.add_text(int(text.timestamp), text.log_level_str(), text.message)
         parts: defaultdict[Source, list[Columns]] = defaultdict(list)
@@ -296,7 +292,8 @@ def _forces_at(times: Int, columns: Columns) -> Columns:
         return {}
     step = np.diff(stamp)
     after = np.searchsorted(stamp, times).clip(1, len(step))
-    bridged = step[after - 1] <= _LONGEST_STEP * np.median(step)
+    # A longer step is a gap.
+    bridged = step[after - 1] <= 3.0 * np.median(step)
     inside = bridged & (times >= stamp[0]) & (times <= stamp[-1])
     return {
         f"force[{k}]": np.where(inside, np.interp(times, stamp, force[:, k]), np.nan)

@@ -94,8 +94,6 @@ def _products(z: Array, forms: Array) -> Array:
 
 BOUND = 3.0
 """Guaranteed bound of a channel in a study, in noise_std: 3 sigma taken for a limit."""
-# loose threshold of `guaranteed`, in bounds, from which its own is found
-LOOSE_BOUNDS = 0.2
 RANKED_BY_SCORE = ("likelihood_ratio", "cusum")
 """Methods that rank suspects by scores. Others rank by the largest normalised error."""
 
@@ -295,8 +293,9 @@ class CommonRate(TrialProtocol[Cell]):
                 FalseAlarmRate(false_alarm_probability=probability).as_options(accepted)
             )
             if not options and "max_faults" in accepted:
+                # A loose threshold, in bounds: its own is found from it.
                 options = {
-                    "threshold": LOOSE_BOUNDS,
+                    "threshold": 0.2,
                     "max_faults": min(2, geometry.n - 4),
                 }
             options |= own.get(name, {})

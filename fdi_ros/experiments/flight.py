@@ -42,8 +42,6 @@ from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import OutcomeKind, quantiles, rms, score, share, standing
 
-STEEPEST = 1.5  # largest slope of the smooth step 3 u^2 - 2 u^3, at its middle
-
 
 @dataclass(frozen=True)
 class Motion:
@@ -86,7 +84,8 @@ def vehicle_motion(
         for target, hold in _phase(str(kind), max_rate, rng):
             step = float(np.abs(target - rates[-1]).max())
             slowest = 1.0 if kind == "turn" else 0.1
-            times += [times[-1] + max(slowest, STEEPEST * step / max_acceleration)]
+            # 1.5: the largest slope of 3 u^2 - 2 u^3, at its middle.
+            times += [times[-1] + max(slowest, 1.5 * step / max_acceleration)]
             times += [times[-1] + hold]
             rates += [target, target]
     return Motion(np.array(times), np.array(rates))

@@ -31,8 +31,6 @@ from fdi_ros.replay.outcomes import Z95, Estimate, mean_of, quantiles, share
 
 FOUND, DERIVED = "found", "derived"
 """Thresholds: found on healthy channels, or derived by each method from the rate."""
-# the loose thresholds have this many times the false-alarm rate asked for
-FALSE_ALARM_MARGIN = 4.0
 
 
 class Snapshot(CommonRate):
@@ -112,7 +110,7 @@ class Snapshot(CommonRate):
 
     def loose(self) -> tuple[NoiseModel, float]:
         """White noise, and more false alarms than asked for."""
-        margin = 1.0 if self._derived else FALSE_ALARM_MARGIN
+        margin = 1.0 if self._derived else 4.0
         return _noise(self.settings["noise_std"]), min(
             margin * max(self.settings["false_alarms"]), 0.9
         )
@@ -213,9 +211,6 @@ def _shares(false_alarm: float, counts: Counts) -> Figures:
 
 # A stream -----------------------------------------------------------------------------
 
-RUN_LENGTH_MARGIN = 3.0  # ratio of the run length asked for to the loose one
-WINDOW_SHARE = 10  # a window of healthy samples is the run length over this
-
 
 class Delay(CommonRate):
     """Delay by size of fault at one mean run length, beside the least possible delay.
@@ -241,7 +236,8 @@ class Delay(CommonRate):
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)
-        self._window = max(round(self.settings["run_length"] / WINDOW_SHARE), 1)
+        # Healthy samples of a tenth of the run length.
+        self._window = max(round(self.settings["run_length"] / 10), 1)
 
     def trial_cells(self) -> list[Cell]:
         """List each size of fault on each geometry."""
@@ -325,9 +321,7 @@ class Delay(CommonRate):
 
     def loose(self) -> tuple[NoiseModel, float]:
         """White noise, and a run length somewhat shorter than the one asked for."""
-        return _noise(self.settings["noise_std"]), RUN_LENGTH_MARGIN / self.settings[
-            "run_length"
-        ]
+        return _noise(self.settings["noise_std"]), 3.0 / self.settings["run_length"]
 
 
 def _ratios(contender: Contender, z: Array) -> Array:

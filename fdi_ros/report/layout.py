@@ -200,14 +200,10 @@ PALETTE = (
 """Colours that colour-blind people can distinguish (after Okabe and Ito)."""
 CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")
 """Colours of the channels."""
-LONG = 24
-"""Length from which on the text of a cell may wrap, characters."""
 TERMINAL = 110
 """Length of a line of sentences, characters."""
 PAPER_ROWS = 60
 """Rows of a table on paper, as in page.css."""
-FEWEST_LINKED = 4
-"""Smallest number of sections for a table of contents."""
 TIME_AXIS = "s from the first sample"
 _SCRIPTS = (
     "plot_data.js",
@@ -347,7 +343,8 @@ def _cell(text: str, tag: str = "td") -> str:
     content = escape(text)
     if isinstance(text, Link) and text.page:
         content = f'<a href="{html.escape(quote(text.page))}">{content}</a>'
-    return f"<{tag}{' class=long' if len(text) > LONG else ''}>{content}</{tag[:2]}>"
+    # Longer texts may wrap.
+    return f"<{tag}{' class=long' if len(text) > 24 else ''}>{content}</{tag[:2]}>"
 
 
 def html_of(content: Content) -> str:
@@ -398,7 +395,7 @@ def page(
         "TITLE": escape(title),
         "VERDICT": "".join(map(_summary_line, summary)),
         "CONTENTS": f'<nav aria-label="contents">{links}</nav>'
-        if len(parts) >= FEWEST_LINKED
+        if len(parts) >= 4
         else "",
         "BODY": "\n".join(line for line in body if line),
         "STYLE": _resource("page.css"),
@@ -542,8 +539,6 @@ BYTES = 600_000
 FINE, SMALL = "f4", "f2"
 """Kinds of a series: 24 bits for values that are compared, 11 bits (0.05 %) for others."""
 LARGEST_HALF = 65504.0
-_TEXT = 4 / 3
-"""Characters of base64 per byte."""
 
 
 class PageStore:
@@ -563,7 +558,8 @@ class PageStore:
     def __init__(self, kinds: Mapping[str, str], most: int | None = None) -> None:
         self.kinds = dict(kinds)
         size = 8 + sum(int(kind[1]) for kind in kinds.values())
-        self._most = most or max(200, int(BYTES / _TEXT / size))
+        # base64 has 4 characters for 3 bytes.
+        self._most = most or max(200, int(BYTES / (4 / 3) / size))
         self.width = 1
         """Number of samples in a new span."""
         self._time = np.empty(0)

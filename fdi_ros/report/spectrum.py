@@ -21,13 +21,8 @@ PIECE = 512
 """Samples of each averaged spectrum."""
 AT_ONCE = 16 * PIECE
 """Samples that are transformed at once."""
-AROUND = 31
-"""Number of frequencies whose median is the baseline of a line."""
 STANDS_OUT = 4.0
 """Smallest ratio of a line to its baseline."""
-FLAT = 0.8
-"""Share of the usual amplitude density at half the sample rate from which on aliasing is likely."""
-MOST_LINES = 3
 
 
 class Spectrum:
@@ -106,12 +101,10 @@ class Spectrum:
 
         half = self._rate / 2
         step = self._rate / PIECE
-        around = median_filter(density, size=(AROUND, 1), mode="nearest")
+        # The median of 31 frequencies is the baseline of a line.
+        around = median_filter(density, size=(31, 1), mode="nearest")
         peaks, about = find_peaks((density / around).max(axis=1), height=STANDS_OUT)
-        found = [
-            (peaks[k] + 1) * step
-            for k in np.argsort(-about["peak_heights"])[:MOST_LINES]
-        ]
+        found = [(peaks[k] + 1) * step for k in np.argsort(-about["peak_heights"])[:3]]
         words = []
         if found:
             lines = ", ".join(
@@ -119,7 +112,8 @@ class Spectrum:
                 for at in found
             )
             words.append(f"Lines stand out at {lines}.")
-        if (around[-1] > FLAT * np.median(density, axis=0)).any():
+        # Aliasing is likely from 0.8 of the usual density on.
+        if (around[-1] > 0.8 * np.median(density, axis=0)).any():
             words.append(
                 f"It does not fall off towards {figures(half)} Hz, half the sample rate: that is white noise, or"
                 " vibration beyond it that is folded down into this picture. A recording at a higher rate tells which."

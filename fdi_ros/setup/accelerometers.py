@@ -55,8 +55,6 @@ IN_G = (0.8, 1.2)
 #: smallest noise_std written, m/s^2: a bench shows less than a flight, and motion of
 #: units that are not sampled at one instant looks like noise
 LEAST_NOISE_STD = float(PARAMETERS["accelerometers.noise_std"].default[0])
-#: smallest scale_std written: nonlinearity of consumer accelerometers
-LEAST_SCALE_STD = 0.002
 
 
 @dataclass
@@ -295,7 +293,8 @@ def _settings(config: Config, active: Int, found: StateEstimate) -> dict[str, ob
 
     axes = axes.copy()
     axes[active] = found.axes
-    scale = max(found.disagreement()[0], LEAST_SCALE_STD)
+    # At least the nonlinearity of consumer accelerometers.
+    scale = max(found.disagreement()[0], 0.002)
     settings: dict[str, object] = {
         "accelerometers.noise_std": changed(
             own.noise_std,

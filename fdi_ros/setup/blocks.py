@@ -22,16 +22,10 @@ from fdi_ros.inspection.turns import WINDOW
 from fdi_ros.model.samples import Array, Block, Int, Mask
 from fdi_ros.setup.noise import projector
 
-#: usual sizes beyond which a value is a spike: vibration has tails, too
-SPIKE = 25.0
 #: samples looked at at once
 SPIKE_PORTION = 256
-#: largest distance of two blocks for a difference, in usual distances of neighbours
-LONGEST_SPAN = 2.5
 #: windows are joined down to this number of groups
 MOST_STEPS = 400
-#: of normal errors: standard deviation over median absolute deviation
-MEDIAN_TO_RMS = 1.4826
 
 
 @dataclass
@@ -109,9 +103,11 @@ def spikes(z: Array, axes: Array) -> Mask:
         whole = size[np.isfinite(size).all(axis=1)]
         if len(whole) < SPIKE_PORTION // 4:
             continue
-        level = MEDIAN_TO_RMS * np.median(whole, axis=0)
+        # 1.4826: deviation of normal errors over their median absolute value.
+        level = 1.4826 * np.median(whole, axis=0)
         ratio = np.nan_to_num(size / np.maximum(level, 1e-9))
-        far = ratio.max(axis=1) > SPIKE
+        # Vibration has tails, too: up to 25 times the usual size.
+        far = ratio.max(axis=1) > 25.0
         # Frequent outliers are not spikes.
         if far.mean() < 0.1:
             found[first + 1 + np.flatnonzero(far), ratio[far].argmax(axis=1)] = True
@@ -170,7 +166,8 @@ class Blocks:
         """
         found = np.full_like(values, np.nan)
         span = self.seconds[2:] - self.seconds[:-2]
-        near = span < LONGEST_SPAN * self.length
+        # Of neighbours, or with one block between them missing.
+        near = span < 2.5 * self.length
         change = (values[2:] - values[:-2]) / span[:, None]
         found[1:-1] = np.where(near[:, None], change, np.nan)
         return found

@@ -79,11 +79,6 @@ LEAST_DURATION, LEAST_SAMPLES, LONGEST_STEP = (
 LEAST_USABLE = 0.3
 #: longest fault, as a share of the recording, for which the others decide
 MOST_FAULTY = 0.35
-#: Largest set, as a share of all channels, whose samples are left out. A larger set
-#: says too little about which channels are right.
-MOST_LEFT_OUT = 1 / 3
-#: s before a declaration that a fault may have begun: most are declared sooner
-LEAD = 1.0
 #: smallest imus.max_skew where smaller delays are taken off, s
 LEAST_SKEW = 5e-5
 #: smallest imus.timeout, in differences of unit delays
@@ -431,14 +426,14 @@ def _watch(
 
 def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data:
     """Leave out short faults of few channels, and refuse lasting ones."""
-    clear = [
-        span for span in faults if len(span.channels) <= MOST_LEFT_OUT * len(names)
-    ]
+    # A larger set says too little about which channels are right.
+    clear = [span for span in faults if len(span.channels) <= (1 / 3) * len(names)]
     z = data.z.copy()
     share = np.zeros(len(names))
     for span in clear:
         share[list(span.channels)] += (span.end - span.start) / data.duration
-        rows = (data.seconds >= span.start - LEAD) & (data.seconds <= span.end)
+        # A fault may have begun 1 s before; most are declared sooner.
+        rows = (data.seconds >= span.start - 1.0) & (data.seconds <= span.end)
         z[np.ix_(np.flatnonzero(rows), np.array(span.channels))] = np.nan
     if share.max() > MOST_FAULTY:
         group = [names[i] for i in np.flatnonzero(share > MOST_FAULTY)]

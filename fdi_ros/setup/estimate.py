@@ -88,9 +88,6 @@ SAME_REST = 5.0
 LOUDER = 4.0
 #: walk of biases that show none, rad/s/sqrt(s)
 USUAL_WALK = 2e-5
-#: If the axes are off by more than this multiple of their prior, the prior is widened.
-#: With two units chance does that once in 60 recordings.
-WIDER = 1.5
 #: Smallest number of blocks for the noise of a window, and of windows for the colour of
 #: the noise; number of blocks in each mean that shows the colour.
 LEAST_BLOCKS = LEAST_WINDOWS = SUBS = 5
@@ -260,8 +257,9 @@ def _widened(sensors: Priors, axes: Array) -> Priors:
     apart = off - axes @ (np.linalg.pinv(axes) @ off)
     size = float(np.sqrt((apart**2).sum() / (3 * (len(axes) - 3))))
     times = size / max(float(np.median(sensors.scale_std)), 1e-9)
+    # With two units chance makes 1.5 once in 60 recordings.
     return replace(
-        sensors, scale_std=sensors.scale_std * (times if times > WIDER else 1.0)
+        sensors, scale_std=sensors.scale_std * (times if times > 1.5 else 1.0)
     )
 
 

@@ -24,9 +24,6 @@ from fdi_ros.model.samples import Array, Int, Mask
 
 #: variance of a channel without noise, (rad/s)^2
 LEAST_VARIANCE = LEAST_NOISE**2
-#: smallest eigenvalue of the information on the rate, relative to the largest, that is
-#: more than rounding
-SINGULAR = 1e-15
 #: windows on both sides that the noise of the moment is averaged over: 5 s, in which
 #: vibration stays
 MEMORY = 2
@@ -58,7 +55,7 @@ def information(variance: Array, axes: Array) -> Array:
     weighted = weight[..., :, None] * axes
     values, vectors = np.linalg.eigh(np.swapaxes(axes, -1, -2) @ weighted)
     # Absent channels may leave no rate, and then no information.
-    known = values > SINGULAR * values[..., -1:]
+    known = values > 1e-15 * values[..., -1:]
     inverse = np.divide(1.0, values, out=np.zeros_like(values), where=known)
     of_rate = weighted @ vectors
     explained = (of_rate * inverse[..., None, :]) @ np.swapaxes(of_rate, -1, -2)

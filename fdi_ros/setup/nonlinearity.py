@@ -21,8 +21,6 @@ import numpy as np
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.setup.noise import information, projector
 
-#: of a and c before anything is shown: no gyro is as bad
-FREE = 0.3
 #: as data sheets state it, 0.01 to 1 %
 USUAL = 2e-3
 #: largest standard error with which a nonlinearity counts as measured: half of the
@@ -95,7 +93,8 @@ def measure(
         products = np.tensordot(part, part, (0, 0))  # (n, SIGNALS, n, SIGNALS)
         normal += known[w][:, None, :, None] * products
         right += np.einsum("bik,bi->ik", part, residual[rows] @ known[w])
-    prior = np.full((n, SIGNALS), FREE)
+    # Before anything is shown: no gyro is as bad.
+    prior = np.full((n, SIGNALS), 0.3)
     prior[:, [0, 4]] = bias_std
     prior[:, 1:4] = np.maximum(scale_std, 1e-6)[:, None]
     size = n * SIGNALS

@@ -77,8 +77,6 @@ LARGE_SWING, LARGE_BIAS = (
 )
 #: of the bias of an accelerometer against the others, m/s^2
 LARGE_FORCE = 1.0
-#: share of the samples that are missing or spikes, which is worth a look
-MANY = 0.01
 #: size of test faults, rad/s, and the share to be found
 FLOOR, LEAST_NAMED = 0.1, 0.9
 #: share of the samples that a monitor should judge
@@ -421,7 +419,8 @@ def _lost_words(result: Calibration) -> list[str]:
     words = []
     for why, count in result.unusable.items():
         usual = why in ("missing", "spikes")
-        if count.max() <= (MANY * found.blocks.count.sum() if usual else 0):
+        # Of these, 1 % of the samples is worth a look.
+        if count.max() <= (0.01 * found.blocks.count.sum() if usual else 0):
             continue
         called = "frozen" if why == "repeated" else why.replace("_", " ")
         which = ", ".join(result.names[i] for i in np.flatnonzero(count))
