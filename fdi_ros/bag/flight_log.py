@@ -63,7 +63,7 @@ _COARSE_RATE = 0.5
 #: distance from neighbours at which a time is damaged, us
 _MAX_TIME_STEP = 10_000_000
 #: messages per batch, few enough that a chunk of a converted bag covers a short time
-_TOGETHER = 1 << 10
+_BATCH_MESSAGES = 1 << 10
 #: instances of one kind, more than any autopilot has, that are looked at for copies
 _MOST_COMPARED = 16
 #: messages that are named of a log without IMUs
@@ -380,9 +380,9 @@ class FlightLog(BagFile):
             stamp = (samples["stamp"] + self._shift) * 1000
             order = np.argsort(stamp, kind="stable")
             horizon = self._log_time(later)
-            for k in range(0, len(order), _TOGETHER):
-                rows = order[k : k + _TOGETHER]
-                rest = order[k + _TOGETHER :]
+            for k in range(0, len(order), _BATCH_MESSAGES):
+                rows = order[k : k + _BATCH_MESSAGES]
+                rest = order[k + _BATCH_MESSAGES :]
                 data = _encoded(templates[place[rows]], stamp[rows], samples.take(rows))
                 count, size = data.shape
                 yield Batch(

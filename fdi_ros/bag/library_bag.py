@@ -16,7 +16,7 @@ from fdi_ros.system.files import (
 )
 
 #: messages handed on at once, at most
-_TOGETHER = 4096
+_BATCH_MESSAGES = 4096
 #: number of its topic in the file, time of recording, ns, and content
 Message = tuple[int, int, bytes]
 
@@ -62,5 +62,5 @@ def _together(messages: Iterator[Message]) -> Iterator[Message]:
     for k, message in enumerate(messages, 1):
         yield message
         held += len(message[2])
-        if k == _TOGETHER or held >= PORTION_BYTES:
+        if k == _BATCH_MESSAGES or held >= PORTION_BYTES:
             return

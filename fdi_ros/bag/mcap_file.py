@@ -175,7 +175,7 @@ _CHUNK = struct.Struct("<QQQII")
 #: messages outside chunks are read in runs of at most this many bytes
 _RUN = 1 << 18
 #: bytes of pieces that form one batch, since each batch has a cost
-_TOGETHER = 1 << 16
+_BATCH_BYTES = 1 << 16
 
 
 class Piece(NamedTuple):
@@ -248,7 +248,7 @@ class McapFile(BagFile):
             read += piece.size
             waiting.append(self._messages(piece))
             held += len(waiting[-1].buffer)
-            if held < _TOGETHER and k < len(self._pieces):
+            if held < _BATCH_BYTES and k < len(self._pieces):
                 continue
             found = Batch.joined(waiting)
             waiting = []

@@ -27,9 +27,9 @@ from fdi_ros.system.text import figures
 
 #: messages handed on together: enough that calls do not count, little enough for the
 #: cache
-_TOGETHER = 16384
+_MOST_AT_ONCE = 16384
 #: messages that wait for earlier ones at most
-_HELD = 1 << 20
+_MOST_WAITING = 1 << 20
 RATE_TOLERANCE = 0.2
 """Relative error of a configured sample rate at which thresholds and times are wrong."""
 _RATE_SAMPLES, _FEWEST_STEPS = 5000, 50
@@ -175,7 +175,7 @@ class Samples:
                     np.flatnonzero(np.diff(together["log_time"] // self.period)) + 1,
                 )
                 yield from whole
-            elif len(together) >= _TOGETHER:
+            elif len(together) >= _MOST_AT_ONCE:
                 yield together
                 together = together[:0]
         if len(together):
@@ -250,20 +250,20 @@ class Samples:
 
     def _ordered(self) -> Iterator[Rows]:
         """Put the messages into the order of recording, as a player would publish them."""
-        held = np.empty(0, self._row)
+        waiting = np.empty(0, self._row)
         done = -1
         for batch in self.recording.batches(self.topics):
-            held = np.concatenate([held, self._decoded(batch)])
-            if (np.diff(held["log_time"]) < 0).any():
-                held = held[np.argsort(held["log_time"], kind="stable")]
-            all_ready = batch.horizon == NO_HORIZON or len(held) > _HELD
+            waiting = np.concatenate([waiting, self._decoded(batch)])
+            if (np.diff(waiting["log_time"]) < 0).any():
+                waiting = waiting[np.argsort(waiting["log_time"], kind="stable")]
+            all_ready = batch.horizon == NO_HORIZON or len(waiting) > _MOST_WAITING
             ready = (
-                len(held)
+                len(waiting)
                 if all_ready
-                else int(np.searchsorted(held["log_time"], batch.horizon))
+                else int(np.searchsorted(waiting["log_time"], batch.horizon))
             )
-            messages = held[:ready]
-            held = held[ready:]
+            messages = waiting[:ready]
+            waiting = waiting[ready:]
             self.progress = batch.progress
             if (
                 len(messages)
@@ -276,8 +276,8 @@ class Samples:
             if len(messages):
                 done = int(messages["log_time"][-1])
                 yield messages
-        if len(held):
-            yield held
+        if len(waiting):
+            yield waiting
 
     def _decoded(self, batch: Batch) -> Rows:
         """Decode a batch; malformed messages and those outside the span are left out."""

@@ -90,7 +90,7 @@ class NoiseModel:
         """
         return NoiseModel(
             **{
-                name: _spread(name, v, n)
+                name: _one_per_channel(name, v, n)
                 for name, v in vars(self).items()
                 if v is not None
             }
@@ -124,7 +124,7 @@ class NoiseModel:
         return np.asarray(total)
 
 
-def _spread(name: str, value: Array, n: int) -> Array:
+def _one_per_channel(name: str, value: Array, n: int) -> Array:
     if value.ndim == 1 and len(value) not in (1, n):
         raise ConfigError(
             f"noise.{name} has {len(value)} values, expected 1 or {n} (one per channel)"

@@ -141,7 +141,7 @@ _TIMES = (
     ("years", 31_557_600, math.inf, 0),
 )
 """Units of time: name, length in s, upper end of use in s, number of decimals."""
-ODD = {
+UNUSED_COUNTERS = {
     "malformed": "malformed messages",
     "duplicate": "repeated stamps",
     "backward": "stamps going back",
@@ -304,10 +304,12 @@ def _whole_message(
     note = "".join(f"; {one}" for one in words if one)
     if not status.has_rate:
         return Level.ERROR, f"no fused rate: {_why_no_rate(status)}{count}{note}"
-    odd = (
+    troubles = (
         worse or concerns or status.copies or any(unit.frozen for unit in status.units)
     )
-    complete = len(healthy) == total and len(status.can_isolate) == total and not odd
+    complete = (
+        len(healthy) == total and len(status.can_isolate) == total and not troubles
+    )
     level = (
         Level.ERROR if not status.can_detect else Level.OK if complete else Level.WARN
     )
@@ -595,40 +597,44 @@ def frame_words(first: str, now: str) -> str:
 
 
 def _input_message(line: InputStatus, more: Sequence[str]) -> tuple[Level, str]:
-    odd = [*more]
-    odd += [
+    troubles = [*more]
+    troubles += [
         f"{kind_in_words}: {line.recent[kind]}"
-        for kind, kind_in_words in ODD.items()
+        for kind, kind_in_words in UNUSED_COUNTERS.items()
         if line.recent.get(kind)
     ]
     if line.recent.get("malformed") and line.error:
-        odd.append(line.error)
+        troubles.append(line.error)
     if line.lag > line.max_lag:
-        odd.append(f"stamps are {_seconds(line.lag)} behind those of the other inputs")
+        troubles.append(
+            f"stamps are {_seconds(line.lag)} behind those of the other inputs"
+        )
     if line.unstamped:
-        odd.append("stamps are not set")
+        troubles.append("stamps are not set")
     elif line.offset is not None and abs(line.offset) > FAR_FROM_NOW:
         side = "behind" if line.offset > 0 else "ahead of"
         why = OLD_WORDS if line.offset > OLD else ""
-        odd.append(f"stamps are {_seconds(abs(line.offset))} {side} the clock{why}")
+        troubles.append(
+            f"stamps are {_seconds(abs(line.offset))} {side} the clock{why}"
+        )
     if line.parted:
-        odd.append(
+        troubles.append(
             "the clocks of the two inputs differ, and it is unknown which is right: neither is used"
         )
     if line.frame_now != line.frame:
-        odd.append(frame_words(line.frame, line.frame_now))
+        troubles.append(frame_words(line.frame, line.frame_now))
     if line.sources:
-        odd.append(line.sources)
+        troubles.append(line.sources)
     if line.silent is None:
-        return Level.STALE, "; ".join([f"no message yet on {line.topic}", *odd])
+        return Level.STALE, "; ".join([f"no message yet on {line.topic}", *troubles])
     if not line.live:
         silence = (
             "gives no usable message"
             if line.arrives
             else f"silent for {_seconds(line.silent)}"
         )
-        return Level.STALE, "; ".join([silence, *odd])
-    return (Level.WARN if odd else Level.OK), "; ".join(odd) or "delivers"
+        return Level.STALE, "; ".join([silence, *troubles])
+    return (Level.WARN if troubles else Level.OK), "; ".join(troubles) or "delivers"
 
 
 def _seconds(value: float) -> str:

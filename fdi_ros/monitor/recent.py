@@ -26,7 +26,7 @@ from fdi_ros.monitor.soundness import (
     RateHealth,
     UnitHealth,
     concerns_of,
-    is_declared,
+    is_declared_or_silent,
     own_noise,
 )
 
@@ -142,7 +142,7 @@ class RecentHealth:
         """
         residuals = np.array([one.residual for one in self._readings])
         enough = np.isfinite(residuals).sum(axis=0) >= LEAST_RESIDUALS
-        if any(map(is_declared, status.channels)) or not enough.any():
+        if any(map(is_declared_or_silent, status.channels)) or not enough.any():
             return [None] * len(status.channels)
         square = np.nansum(residuals**2, axis=0) / np.isfinite(residuals).sum(axis=0)
         noise: list[float | None] = [None] * len(status.channels)

@@ -276,7 +276,7 @@ _BY_URGENCY = (Word.HEALTHY, Word.LOOK, Word.CANNOT_TELL, Word.FAULTY)
 
 def live_word(status: Status, concerns: Sequence[Concern]) -> Word:
     """Return the first word of the verdict on a monitor at its last sample."""
-    if any(map(is_declared, status.channels)):
+    if any(map(is_declared_or_silent, status.channels)):
         return Word.FAULTY
     far = any(map(status.has_implausible_start_bias, status.channels))
     if not status.has_rate or not status.can_detect or far:
@@ -289,7 +289,7 @@ def live_word(status: Status, concerns: Sequence[Concern]) -> Word:
     return word_of(concerns)
 
 
-def is_declared(channel: ChannelStatus) -> bool:
+def is_declared_or_silent(channel: ChannelStatus) -> bool:
     """Whether a channel is declared faulty, alone or in a set, or is silent."""
     declared = (ChannelState.FAULTY, ChannelState.AMBIGUOUS, ChannelState.STALE)
     return channel.state in declared

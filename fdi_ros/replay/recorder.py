@@ -51,10 +51,10 @@ from fdi_ros.replay.episodes import (
 )
 from fdi_ros.replay.outcomes import SQUARED, finite
 
-Told = NDArray[np.uint8]
+ReducedStates = NDArray[np.uint8]
 """States of channels, where states without a declaration count as OK."""
 S = ChannelState
-_DECLARED, _TOLD, _HIDING = (
+_DECLARED, _EPISODE_STATES, _HIDING = (
     (S.AMBIGUOUS, S.FAULTY),
     (S.AMBIGUOUS, S.FAULTY, S.STALE),
     (S.STALE, S.SUSPECT),
@@ -64,10 +64,13 @@ _DECLARED, _TOLD, _HIDING = (
 MOST_EPISODES = 1000
 MOST_STEPS = 20
 """Largest number of steps of an episode. The last step is always kept."""
-TOGETHER = 0.5
-"""Channels of a unit that fall silent within this time, s, belong to one episode. Silence shorter
-than `HOLE` that begins within this time after a hole belongs to the hole. The rate before an
-episode is the one at this time before its start."""
+UNIT_SILENCE = 0.5
+"""Channels of a unit that fall silent within this time, s, belong to one episode."""
+AFTER_HOLE = 0.5
+"""Silence shorter than `HOLE` that begins within this time after a hole, s, belongs to the
+hole."""
+RATE_BEFORE = 0.5
+"""The rate before an episode is the one at this time before its start, s."""
 _DIAGONAL = [0, 3, 5]
 """Indices of the diagonal in the upper triangle of a symmetric 3 x 3 matrix."""
 LEAST_HOLE = 0.1
@@ -119,7 +122,7 @@ class Recorder:
         )
         """(3, n) standard deviations of noise, rad/s, scale factor, 1, and bias, rad/s."""
         self._pairs = lone_pairs(geometry)
-        self._before: Told = np.zeros(geometry.n, dtype=np.uint8)
+        self._before: ReducedStates = np.zeros(geometry.n, dtype=np.uint8)
         self._tail = np.empty((0, 2))
         """Times, s, and standard deviations of the fused rate, rad/s, of the latest samples."""
         self._interval = np.inf
@@ -216,7 +219,7 @@ class Recorder:
             self._more,
         )
 
-    def _told(self, state: NDArray[np.uint8]) -> Told:
+    def _told(self, state: NDArray[np.uint8]) -> ReducedStates:
         """Reduce states (N, n) to declarations. A hidden declaration is kept."""
         if not state.any():
             return state
@@ -228,7 +231,9 @@ class Recorder:
         told[(state == S.UNCHECKED) | ((state == S.SUSPECT) & ~in_sets)] = S.OK
         return told
 
-    def _add_to_stretch(self, time: Array, output: Output, before: Told) -> None:
+    def _add_to_stretch(
+        self, time: Array, output: Output, before: ReducedStates
+    ) -> None:
         """Count samples. ``before``: reduced states before each sample."""
         part = self._part or Stretch(float(time[0]), float(time[0]), 0, 0, 0.0)
         judged = np.isfinite(output.threshold)
@@ -243,12 +248,16 @@ class Recorder:
         )
 
     def _change(
-        self, at: float, before: Told, now: Told, reasons: Mapping[int, str]
+        self,
+        at: float,
+        before: ReducedStates,
+        now: ReducedStates,
+        reasons: Mapping[int, str],
     ) -> None:
         """Apply the changes of one sample. ``reasons``: reason by channel."""
         new = {
             kind: set(np.flatnonzero((now == kind) & (before != kind)).tolist())
-            for kind in _TOLD
+            for kind in _EPISODE_STATES
         }
 
         def reason_of(members: set[int]) -> str:
@@ -289,7 +298,7 @@ class Recorder:
             silent = [
                 one for one in self._open if one.kind == S.STALE and one.members <= unit
             ]
-            if lately := [one for one in silent if at - one.start <= TOGETHER]:
+            if lately := [one for one in silent if at - one.start <= UNIT_SILENCE]:
                 self._step(lately[0], lately[0].members | group, lately[0].since)
             else:
                 self._begin(S.STALE, group, at, reason_of(group), std)
@@ -312,7 +321,8 @@ class Recorder:
     def _row_before(self, at: float) -> int:
         """Return the row of the tail shortly before a time, s, or the first row."""
         return max(
-            0, int(np.searchsorted(self._tail[:, 0], at - TOGETHER, side="right")) - 1
+            0,
+            int(np.searchsorted(self._tail[:, 0], at - RATE_BEFORE, side="right")) - 1,
         )
 
     def _begin(
@@ -320,7 +330,7 @@ class Recorder:
     ) -> None:
         """Open an episode."""
         self._open.append(
-            _Open(kind, set(), at, at, reason, std, at - self._resumed <= TOGETHER)
+            _Open(kind, set(), at, at, reason, std, at - self._resumed <= AFTER_HOLE)
         )
         self._step(self._open[-1], members, at)
 
@@ -349,12 +359,14 @@ class Recorder:
         left = channels - set().union(*groups)
         return [*(group for group in groups if group), *({i} for i in sorted(left))]
 
-    def _is_over(self, one: _Open, now: Told) -> bool:
+    def _is_over(self, one: _Open, now: ReducedStates) -> bool:
         if one.kind == S.AMBIGUOUS:
             return all(now[i] not in (S.AMBIGUOUS, *_HIDING) for i in one.members)
         return all(now[i] != one.kind for i in one.members)
 
-    def _take(self, rows: slice, time: Array, output: Output, told: Told) -> None:
+    def _take(
+        self, rows: slice, time: Array, output: Output, told: ReducedStates
+    ) -> None:
         """Add samples with equal states to the open episodes."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = output.statistic[rows] / output.threshold[rows]
@@ -377,7 +389,7 @@ class Recorder:
                 self._measure(one, rows, time[rows], output, told)
 
     def _measure(
-        self, one: _Open, rows: slice, time: Array, output: Output, told: Told
+        self, one: _Open, rows: slice, time: Array, output: Output, told: ReducedStates
     ) -> None:
         """Add the errors of the channels of an episode, measured by the other channels."""
         axes = self._geometry.axes

@@ -10,7 +10,7 @@ from typing import Any
 
 from fdi_ros.faults.fault import ACCELEROMETERS
 from fdi_ros.faults.kinds import FAULT_KINDS
-from fdi_ros.monitor.diagnostics import ODD
+from fdi_ros.monitor.diagnostics import UNUSED_COUNTERS
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
 from fdi_ros.monitor.soundness import UnitHealth, Word, short_names
 from fdi_ros.replay.episodes import (
@@ -130,12 +130,12 @@ def notes(summary: Summary) -> list[str]:
             f"{stream.disordered} messages not used: they were recorded out of order"
         )
     for topic, counters in stream.alignment.items():
-        odd = ", ".join(
-            f"{ODD.get(name, f'samples {name}')}: {n}"
+        unused = ", ".join(
+            f"{UNUSED_COUNTERS.get(name, f'samples {name}')}: {n}"
             for name, n in counters.items()
             if n and name != "received"
         )
-        lines += [f"{topic}: {odd}"] if odd else []
+        lines += [f"{topic}: {unused}"] if unused else []
     if missing := scores.samples - scores.samples_with_rate:
         bias = summary.monitor.bias.state
         lines.append(f"no fused rate in {missing} samples (start-up bias: {bias})")
