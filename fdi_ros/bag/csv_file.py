@@ -129,9 +129,15 @@ class CsvLog(FlightLog):
         """Return nothing: a table has rates and accelerations only."""
         return FlightContext()
 
+    def _note_columns(self, line: str, names: str = "", why: str = "") -> None:
+        """Note how columns were chosen, and those of a gyro that are left out."""
+        self.note(line)
+        if names:
+            self.leave_out(names, why)
+
     def portions(self) -> Iterator[Portion]:
         """Read the table from its start up to `end`."""
-        delimiter, columns = find_columns(self.file, self.note, self.first)
+        delimiter, columns = find_columns(self.file, self._note_columns, self.first)
         offset = self.file.tell()
         bad = 0
         rest = b""
@@ -208,7 +214,7 @@ def unit_numbers(paths: Sequence[Path]) -> list[int]:
 
 
 def find_columns(
-    file: BinaryIO, note: Callable[[str], None], first: int = 0
+    file: BinaryIO, note: Callable[..., None], first: int = 0
 ) -> tuple[str, Columns]:
     """Return the delimiter and the columns to read, and move the file behind the names.
 
@@ -266,7 +272,7 @@ class _Choice(NamedTuple):
 
 
 def _columns(
-    file: BinaryIO, names: Sequence[str], note: Callable[[str], None], first: int
+    file: BinaryIO, names: Sequence[str], note: Callable[..., None], first: int
 ) -> Columns:
     """Choose the columns and note the choice.
 
@@ -287,7 +293,7 @@ def _columns(
 
 
 def _chosen_names(
-    file: BinaryIO, names: Sequence[str], note: Callable[[str], None]
+    file: BinaryIO, names: Sequence[str], note: Callable[..., None]
 ) -> _Choice:
     """Choose columns by ``columns.yaml`` in the folder of a table, else by their names."""
     path = Path(file.name).parent / COLUMNS
@@ -331,7 +337,7 @@ def _places(
 
 
 def _note_choice(
-    choice: _Choice, columns: Columns, note: Callable[[str], None], first: int
+    choice: _Choice, columns: Columns, note: Callable[..., None], first: int
 ) -> None:
     """Note which columns are read, and in which units."""
     source = COLUMNS if "imus" in choice.given else "their names"
@@ -355,7 +361,7 @@ def _note_choice(
 def has_gyros(file: BinaryIO) -> bool:
     """Whether a table has columns of gyros."""
     try:
-        find_columns(file, lambda _: None)
+        find_columns(file, lambda *_: None)
     except BagError:
         return False
     return True
@@ -403,7 +409,7 @@ def _triads(names: Sequence[str]) -> dict[tuple[str, str], dict[str, str]]:
     return groups
 
 
-def _imus(names: Sequence[str], note: Callable[[str], None]) -> list[list[str]]:
+def _imus(names: Sequence[str], note: Callable[..., None]) -> list[list[str]]:
     """Return the columns x, y, z of each gyro, by names of gyros, or else by any names.
 
     A gyro that lacks an axis is noted and left out.
@@ -416,10 +422,10 @@ def _imus(names: Sequence[str], note: Callable[[str], None]) -> list[list[str]]:
     }
     for key, axes in groups.items():
         if key not in whole and _is_gyro(key[0]):
-            note(
-                f"{' and '.join(axes.values())} {'is' if len(axes) == 1 else 'are'} left"
-                f" out: no column for {' and '.join(sorted(set('xyz') - set(axes)))}"
-            )
+            found = " and ".join(axes.values())
+            why = f"no column for {' and '.join(sorted(set('xyz') - set(axes)))}"
+            verb = "is" if len(axes) == 1 else "are"
+            note(f"{found} {verb} left out: {why}", f"the gyro of {found}", why)
     gyros = [axes for (head, _), axes in whole.items() if _is_gyro(head)]
     return gyros or [
         axes for (head, _), axes in whole.items() if not _OTHER.search(head)

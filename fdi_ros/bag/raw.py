@@ -22,7 +22,7 @@ from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Bytes, Int
 from fdi_ros.system.files import FILES, open_regular
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import first_of, shown
 from fdi_ros.system.yaml_file import read_yaml
 
 #: characters shown about one place
@@ -130,6 +130,9 @@ class Damage:
     lines: list[str] = field(default_factory=list)
     more: int = 0
 
+    #: gyros that cannot be read as such, and why
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
     #: lines kept, while further ones are only counted
     MOST = 20
 
@@ -213,6 +216,15 @@ class BagFile(ABC):
         """Note damage, or a fact that readers must know."""
         self._damage.add(f"{self.path.name}: {line}")
 
+    def leave_out(self, names: str, why: str) -> None:
+        """Note gyros that cannot be read as such."""
+        one = (shown(names), why)
+        if (
+            one not in self._damage.left_out
+            and len(self._damage.left_out) < Damage.MOST
+        ):
+            self._damage.left_out.append(one)
+
     def close(self) -> None:
         """Close the file."""
         self.file.close()
@@ -226,6 +238,8 @@ EXPECTED = (
 )
 #: first bytes of the placeholder that git-lfs leaves for a large file
 LFS = b"version https://git-lfs."
+#: recordings that a refusal names
+MOST_NAMED = 4
 #: key in the custom data of the metadata.yaml of an output bag
 MADE_BY_FDI = "fdi_ros"
 
@@ -252,14 +266,9 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
     for name in names.keys() - set(there):
         damage.add(f"{Path(name).name} is named in metadata.yaml and not there")
     # metadata.yaml is written last. Without it, numbers in the names give the order.
-    paths = [path / name for name in there] or sorted(
-        (
-            child
-            for child in path.iterdir()
-            if child.is_file() and child.name.endswith(SUFFIXES)
-        ),
-        key=lambda child: natural_order(child.name),
-    )
+    paths = [path / name for name in there]
+    if not paths:
+        paths = _pieces_of_one(path)
     if not paths:
         logs = any(
             child.is_file() and child.name.lower().endswith(LOG_SUFFIXES)
@@ -272,6 +281,27 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
             f"{len(paths)} files, expected at most {FILES}: the others were left out"
         )
     return tuple(paths[:FILES])
+
+
+def _pieces_of_one(folder: Path) -> list[Path]:
+    """Return the files of a bag that was cut off, in the order of the numbers in their names.
+
+    `BagError` if the names, without these numbers, are those of several recordings.
+    """
+    paths = [
+        child
+        for child in folder.iterdir()
+        if child.is_file() and child.name.endswith(SUFFIXES)
+    ]
+    paths.sort(key=lambda child: natural_order(child.name))
+    stems = {re.sub(r"[_-]?[0-9]*$", "", path.name.partition(".")[0]) for path in paths}
+    if len(stems) > 1 and not (folder / "metadata.yaml").exists():
+        names = first_of([shown(path.name) for path in paths], MOST_NAMED)
+        raise BagError(
+            f"{folder} holds several recordings ({names}): name one of them, or run fdi fleet"
+            " on the folder"
+        )
+    return paths
 
 
 def tables_of(folder: Path) -> tuple[Path, ...]:

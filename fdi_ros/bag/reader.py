@@ -46,7 +46,7 @@ from fdi_ros.system.files import (
     open_regular,
     scratch_folder,
 )
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import did_you_mean, shown
 
 FORMATS: dict[str, type[BagFile]] = {
     ".mcap": McapFile,
@@ -165,7 +165,9 @@ class Recording:
                     )
                     or "none at all"
                 )
-                raise BagError(f"{self.path} has no topic {name!r}, it has: {listed}")
+                meant, found, _ = did_you_mean(name, list(there)).partition("?")
+                hint = f", {meant}? It has" if found else ", it has"
+                raise BagError(f"{self.path} has no topic {name!r}{hint}: {listed}")
             called = f"topic {name!r} in {self.path}"
             if topic.type != type_name:
                 raise BagError(

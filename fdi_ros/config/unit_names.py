@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Names of units, taken from the topics that carry them."""
+"""Names of units, taken from the topics that carry them, and of their channels in short."""
 
 from __future__ import annotations
 
@@ -62,3 +62,20 @@ def _common(paths: Sequence[Sequence[str]]) -> int:
             break
         count += 1
     return count
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Replace the three axes of a gyro or accelerometer by one name, in the order of the names.
+
+    ``imu_0.x, imu_0.y, imu_0.z`` become ``imu_0``, and those of its accelerometer
+    ``imu_0.accel``.
+    """
+    axes: dict[str, list[str]] = {}
+    for name in names:
+        axes.setdefault(name[:-1], []).append(name[-1:])
+    found: dict[str, None] = {}
+    for name in names:
+        stem = name[:-1]
+        whole = stem.endswith((".", "accel_")) and axes[stem] == ["x", "y", "z"]
+        found[stem[:-1] if whole else name] = None
+    return list(found)

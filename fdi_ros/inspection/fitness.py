@@ -31,7 +31,7 @@ from fdi_ros.model.noise import noisier_words
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
 from fdi_ros.report.layout import RADIANS, Unit
-from fdi_ros.system.text import figures, first_of, shown
+from fdi_ros.system.text import figures, first_of, listed, shown
 
 _OF_A_MONITOR = {
     topic.name.rpartition("/")[2]
@@ -213,13 +213,26 @@ def _unusable(report: TopicReport) -> str:
     return next((words for words, holds in reasons.items() if holds), "")
 
 
+def _in_bursts(chosen: Sequence[TopicReport]) -> str:
+    """Name the units whose stamps do not show when they measured, may be empty."""
+    some = [one for one in chosen if one.kind is not None and one.kind.stamped]
+    some = [one for one in some if one.burst > 1]
+    if not some:
+        return ""
+    names = listed([shown(one.topic.name) for one in some])
+    return (
+        f"two units with stamps of the time of measurement: those of {names} come in bursts"
+        f" of about {max(one.burst for one in some)}; stamp each sample when it is measured"
+    )
+
+
 def needs(reports: Sequence[TopicReport]) -> str:
     """Return the needs of a recording, with the trouble of each topic.
 
     Empty if a config can be made.
     """
     if chosen := candidates(reports):
-        return in_degrees(chosen)
+        return in_degrees(chosen) or _in_bursts(chosen)
     why = [
         (shown(report.topic.name), _unusable(report))
         for report in reports

@@ -10,13 +10,14 @@ a whole flight, the live monitor its last seconds, by the same records.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from fdi_ros.config.unit_names import short_names
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.noise import much_noisier
 from fdi_ros.model.samples import Array
@@ -136,26 +137,11 @@ class Concern(NamedTuple):
     """What is wrong, as it continues the names: ``has 24 spikes``."""
     joined_by: str = "and"
     """``or``: about one of the names, and which one is not known."""
+    is_noise: bool = False
+    """Whether it is about noise for a time."""
 
     def __str__(self) -> str:
         return f"{listed(short_names(self.who), self.joined_by)} {self.words}"
-
-
-def short_names(names: Sequence[str]) -> list[str]:
-    """Replace the three axes of a gyro or accelerometer by one name, in the order of the names.
-
-    ``imu_0.x, imu_0.y, imu_0.z`` become ``imu_0``, and those of its accelerometer
-    ``imu_0.accel``.
-    """
-    axes: dict[str, list[str]] = {}
-    for name in names:
-        axes.setdefault(name[:-1], []).append(name[-1:])
-    found: dict[str, None] = {}
-    for name in names:
-        stem = name[:-1]
-        whole = stem.endswith((".", "accel_")) and axes[stem] == ["x", "y", "z"]
-        found[stem[:-1] if whole else name] = None
-    return list(found)
 
 
 PASSES = 20
@@ -211,6 +197,7 @@ def concerns_of(
     slow = [unit for unit in units if _is_slow(unit)]
     by_unit = {unit.name for unit in slow}
     alone = [one for one in channels if one.unit not in by_unit]
+    noisier = _noisier(channels)
     return [
         *_alike(
             [one for one in channels if one.checked < LEAST_CHECKED],
@@ -254,11 +241,11 @@ def concerns_of(
             for one in channels
             if one.spikes >= LEAST_SPIKES
         ),
-        *_noisy_for_a_time([one for one in channels if _is_noisy(one)]),
+        *_noisy_for_a_time([one for one in channels if _is_noisy(one)], noisier),
         *(
-            concern
-            for unit in dict.fromkeys(one.measured_in for one in channels)
-            for concern in _noisy([one for one in channels if one.measured_in == unit])
+            Concern(Word.LOOK, (one.name,), f"is {noisier[one.name]}")
+            for one in channels
+            if one.name in noisier and not _is_noisy(one)
         ),
     ]
 
@@ -345,8 +332,12 @@ def _is_noisy(one: ChannelHealth) -> bool:
     return one.noisy_s >= LEAST_NOISY_S
 
 
-def _noisy_for_a_time(channels: Sequence[ChannelHealth]) -> list[Concern]:
+def _noisy_for_a_time(
+    channels: Sequence[ChannelHealth], noisier: Mapping[str, str]
+) -> list[Concern]:
     """Return concerns about channels that were noisy for a time, one for each time.
+
+    The usual noise follows what lasts, so words on the noise over all follow.
 
     Channels of several units that are noisy at once measure the same axis: only their
     difference is known, and one of them is noisy.
@@ -364,8 +355,11 @@ def _noisy_for_a_time(channels: Sequence[ChannelHealth]) -> list[Concern]:
             f" for {first.noisy_s:.1f} s, {when}"
         )
         names = tuple(one.name for one in channels if one in same)
+        if len(names) == 1 and names[0] in noisier:
+            words += f"; over all it is {noisier[names[0]]}"
         several = len({one.unit for one in same}) > 1
-        found.append(Concern(Word.LOOK, names, words, "or" if several else "and"))
+        joined_by = "or" if several else "and"
+        found.append(Concern(Word.LOOK, names, words, joined_by, is_noise=True))
     return found
 
 
@@ -377,26 +371,21 @@ def _are_noisy_together(one: ChannelHealth, other: ChannelHealth) -> bool:
     )
 
 
-def _noisy(channels: Sequence[ChannelHealth]) -> list[Concern]:
-    """Return a concern for each channel that is much noisier than all other units.
-
-    Channels with a spell of noise have a concern already.
-    """
-    noise = np.array(
-        [
-            math.nan if one.own_noise_rad_s is None else one.own_noise_rad_s
-            for one in channels
-        ]
-    )
-    units: dict[str, list[int]] = {}
-    for i, one in enumerate(channels):
-        units.setdefault(one.unit or one.name, []).append(i)
-    return [
-        Concern(
-            Word.LOOK,
-            (channels[i].name,),
-            f"is {noise[i] / beside:.0f} times as noisy as the other units",
+def _noisier(channels: Sequence[ChannelHealth]) -> dict[str, str]:
+    """Describe each channel that is much noisier than all other units, by name."""
+    found = {}
+    for quantity in dict.fromkeys(one.measured_in for one in channels):
+        half = [one for one in channels if one.measured_in == quantity]
+        noise = np.array(
+            [
+                math.nan if one.own_noise_rad_s is None else one.own_noise_rad_s
+                for one in half
+            ]
         )
-        for i, beside in much_noisier(noise, list(units.values()))
-        if not _is_noisy(channels[i])
-    ]
+        units: dict[str, list[int]] = {}
+        for i, one in enumerate(half):
+            units.setdefault(one.unit or one.name, []).append(i)
+        for i, beside in much_noisier(noise, list(units.values())):
+            times = f"{noise[i] / beside:.0f} times as noisy as the other units"
+            found[half[i].name] = times
+    return found

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.config.config import Config
+from fdi_ros.config.unit_names import short_names
 from fdi_ros.core.bias import (
     FIXED,
     IN_MOTION,
@@ -34,7 +35,6 @@ from fdi_ros.model.noise import assumption_words
 from fdi_ros.model.quantity import RATE, Quantity
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
-from fdi_ros.monitor.soundness import short_names
 from fdi_ros.system.text import listed, plus_minus
 
 # standard deviations from which two channels of a larger set surely differ

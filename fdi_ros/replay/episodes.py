@@ -344,7 +344,7 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
 
 def is_factor(share: float) -> bool:
     """Whether a scale error is so large that words give the factor, not the percentage."""
-    return not -1.2 <= share <= 1.0
+    return not -1.2 <= share <= 0.9
 
 
 def true_quantity(unit: Unit) -> str:

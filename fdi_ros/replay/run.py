@@ -602,6 +602,7 @@ def _stream_result(samples: Samples, settings: Config, judge: Judge) -> StreamRe
         disordered=samples.disordered,
         alignment=dict(zip(samples.topics, counters, strict=True)),
         damage=samples.recording.damage.report(),
+        unused=tuple(samples.recording.damage.left_out),
     )
 
 
@@ -626,7 +627,7 @@ def _judge_of(
 
 def with_unused(summary: Summary, unused: Sequence[tuple[str, str]]) -> Summary:
     """Return a summary whose verdict includes gyro topics that were left out, with reasons."""
-    stream = replace(summary.stream, unused=tuple(unused))
+    stream = replace(summary.stream, unused=(*summary.stream.unused, *unused))
     summary = replace(summary, stream=stream)
     return replace(summary, verdict=verdict_of(summary))
 

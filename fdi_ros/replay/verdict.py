@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 
 from fdi_ros.core.states import Reason
-from fdi_ros.monitor.soundness import Word, word_of
+from fdi_ros.monitor.soundness import Concern, Word, word_of
 from fdi_ros.replay.episodes import (
     MOST_TOLD,
     Episode,
@@ -44,7 +44,7 @@ def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
         names = dict.fromkeys(name for one in faulty for name in one.channels)
         return ReplayVerdict(
             Word.FAULTY.value,
-            f"FAULTY: {_faulty_sentences(faulty, unit)}",
+            f"FAULTY: {_faulty_sentences(judgement, faulty, unit)}",
             tuple(names),
         )
     if why := unjudged_words(judgement):
@@ -150,24 +150,75 @@ def _healthy_words(judgement: Judgement) -> str:
 # A fault in one sentence for the person who flies
 
 
-def _faulty_sentences(faulty: Sequence[Episode], unit: Unit) -> str:
+def _faulty_sentences(
+    judgement: Judgement, faulty: Sequence[Episode], unit: Unit
+) -> str:
     """Return sentences on the first episode, and the names in the others."""
     first = faulty[0]
-    sentences = [
-        f"{_who(first)} {_when(first)}.",
-        *_size_sentences(first, unit),
-        *_reason_sentences(first),
-    ]
+    if frozen := _frozen_unit(judgement, first):
+        sentences = [
+            f"{frozen}, all axes, {_when(first)}.",
+            f"Reason: {Reason.FROZEN.value}.",
+        ]
+    else:
+        sentences = [
+            f"{_who(first)} {_when(first)}.",
+            *_size_sentences(first, unit),
+            *_reason_sentences(first),
+        ]
     if first.since_s - first.start_s >= 0.05:
         sentences.append(f"First seen at {first.start_s:.1f} s.")
     others = dict.fromkeys(one.who for one in faulty[1:] if one.who != first.who)
     if others:
         sentences.append(f"Later also {first_of(list(others), MOST_TOLD)}.")
+    sentences += [f"{one}." for one in noise_behind(judgement)[:MOST_CONCERNS]]
     return " ".join(sentences)
 
 
-_WITHOUT_SIZE = (Reason.NON_FINITE.value, Reason.STUCK.value, Reason.FROZEN.value)
-"""Reasons that say all: the size of the error changes with the motion."""
+def noise_behind(judgement: Judgement) -> list[Concern]:
+    """Return the noise that explains declarations, if these are brief sets alone.
+
+    Evidence for one channel does not last while its error changes its sign.
+    """
+    faulty = faulty_episodes(judgement)
+    brief = all(
+        one.state == "AMBIGUOUS" and not one.stands and one.end_s - one.since_s < BRIEF
+        for one in faulty
+    )
+    if not faulty or not brief:
+        return []
+    return [one for one in judgement.concerns if one.is_noise]
+
+
+def _frozen_unit(judgement: Judgement, one: Episode) -> str:
+    """Return the unit of a set if the whole unit is frozen at the end. Empty: it is not."""
+    units = {
+        channel.unit
+        for channel in judgement.monitor.channels
+        if channel.name in one.channels
+    }
+    if one.state != "AMBIGUOUS" or len(units) != 1 or "" in units:
+        return ""
+    (unit,) = units
+    own = [
+        channel
+        for channel in judgement.monitor.channels
+        if channel.unit == unit and channel.measured_in == one.measured_in
+    ]
+    frozen = all(channel.reason == Reason.FROZEN.value for channel in own)
+    return unit if frozen else ""
+
+
+_WITHOUT_SIZE = tuple(
+    reason.value
+    for reason in (
+        Reason.NON_FINITE,
+        Reason.STUCK,
+        Reason.FROZEN,
+        Reason.INTERMITTENT,
+    )
+)
+"""Reasons that say all: the size of the error changes with the motion, or there is none."""
 
 
 def _who(one: Episode) -> str:

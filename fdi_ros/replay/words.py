@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from fdi_ros.config.unit_names import short_names
 from fdi_ros.faults.fault import ACCELEROMETERS
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import UNUSED_COUNTERS
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
-from fdi_ros.monitor.soundness import UnitHealth, Word, short_names
+from fdi_ros.monitor.soundness import UnitHealth, Word
 from fdi_ros.replay.episodes import (
     MOST_TOLD,
     Episode,
@@ -26,6 +27,7 @@ from fdi_ros.replay.summary import ChannelResult, SampleRate, Summary
 from fdi_ros.replay.verdict import (
     LASTING,
     MOST_CONCERNS,
+    noise_behind,
     unjudged_words,
     verdict_of,
     wrongly_named,
@@ -71,7 +73,8 @@ def _concern_lines(summary: Summary) -> list[str]:
     """Return the concerns that the verdict does not list."""
     word = verdict_of(summary).word
     deciding = [one for one in summary.concerns if one.word.value == word]
-    others = [one for one in summary.concerns if one not in deciding[:MOST_CONCERNS]]
+    said = [*deciding[:MOST_CONCERNS], *noise_behind(summary)[:MOST_CONCERNS]]
+    others = [one for one in summary.concerns if one not in said]
     return [f"{str(one).replace('the fused', 'The fused', 1)}." for one in others]
 
 

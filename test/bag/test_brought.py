@@ -95,6 +95,65 @@ def test_stamps_in_bursts_have_the_rate_of_the_whole_and_their_unit_is_left_out(
     assert "imu_0, imu_2 mounted alike" in replayed.out
 
 
+@pytest.mark.parametrize("bursting", [(1, 2), (0, 1, 2)])
+def test_bursts_of_all_but_one_unit_are_refused_by_name(
+    bursting, tmp_path, fdi, refused
+):
+    """A rate that was guessed from them would be refused as the recording's own."""
+    time, rates = drive(rate=200.0, seconds=12.0)
+    messages = []
+    for k, unit in enumerate(rates):
+        stamps = burst(time, 20) if k in bursting else time
+        for at, stamp, rate in zip(time, stamps, unit, strict=True):
+            log, stamp = (START + round(1e9 * one) for one in (at, stamp))
+            messages.append((f"/imu_{k}/data", log, imu(stamp, rate)))
+    messages.sort(key=lambda one: one[1])
+    write_mcap(tmp_path / "bag.mcap", messages)
+    first = fdi("inspect", tmp_path / "bag.mcap").out.splitlines()[0]
+    assert first.startswith("NEEDS two units with stamps of the time of measurement")
+    for said in (first, refused("replay", tmp_path / "bag.mcap")):
+        assert "come in bursts of about 20; stamp each sample when it is mea" in said
+        assert all(f"/imu_{k}/data" in said for k in bursting)
+
+
+def test_a_gyro_without_one_of_its_columns_is_no_healthy_gyro(tmp_path, fdi):
+    time, rates = drive()
+    path = write_csv(tmp_path / "a.csv", time, rates)
+    cut = [line.rpartition(",")[0] for line in path.read_text().splitlines()]
+    path.write_text("\n".join(cut))
+    done = fdi("replay", path)
+    first = done.out.splitlines()[0]
+    why = "the gyro of gyro2_x and gyro2_y is left out: no column for z."
+    assert first == f"LOOK: no fault was found in 30.0 s, but {why}"
+    assert done.code == 4
+
+
+def test_a_folder_of_recordings_is_not_read_as_one(tmp_path, fdi, refused):
+    time, rates = drive(seconds=10.0)
+    for name in ("monday.mcap", "tuesday.mcap"):
+        write_bag(tmp_path / name, time, rates)
+    said = refused("replay", tmp_path)
+    assert "holds several recordings (monday.mcap, tuesday.mcap): name one" in said
+    assert "fdi fleet" in said
+    # The pieces of one bag differ in their numbers.
+    for k, name in enumerate(("monday.mcap", "tuesday.mcap")):
+        (tmp_path / name).rename(tmp_path / f"flight_{k}.mcap")
+    assert "no fault was found" in fdi("replay", tmp_path).out
+
+
+def test_a_topic_that_is_not_there_is_compared_with_those_that_are(tmp_path, refused):
+    time, rates = drive(seconds=2.0)
+    path = write_bag(tmp_path / "bag.mcap", time, rates)
+    config = tmp_path / "two.yaml"
+    topics = "[/imu_0/data, /imu_2/dat]"
+    config.write_text(
+        "/**:\n  ros__parameters:\n    input: imus\n    sample_rate: 50.0\n"
+        f"    imus:\n      topics: {topics}\n"
+    )
+    said = refused("replay", path, "--config", config)
+    assert "no topic '/imu_2/dat', did you mean '/imu_2/data'? It has: " in said
+
+
 def test_stamps_that_jitter_are_no_bursts(tmp_path, fdi):
     time, rates = drive()
     time = np.sort(time + np.random.default_rng(1).uniform(-0.008, 0.008, len(time)))

@@ -14,7 +14,7 @@ from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdi_ros.config.unit_names import unit_names
+from fdi_ros.config.unit_names import short_names, unit_names
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
@@ -25,7 +25,6 @@ from fdi_ros.monitor.soundness import (
     Word,
     concerns_of,
     own_noise,
-    short_names,
     word_of,
 )
 from fdi_ros.replay.health import MOST_WINDOWS, Deliveries, Values
@@ -194,6 +193,52 @@ def test_own_noise_is_that_of_the_channel_and_not_of_its_weight():
     assert own_noise(residual, axes) == pytest.approx(noise, rel=1e-3)
     residual[4] = np.nan
     assert np.isfinite(own_noise(residual, axes)).tolist() == [k != 4 for k in range(9)]
+
+
+def three_units(path, strike):
+    """A table of three units that turn, the second one struck: `strike(time, its rates)`."""
+    time = np.arange(0, 30, 0.01)
+    random = np.random.default_rng(5)
+    turn = 0.5 * np.clip(time - 6, 0, 1)[:, None] * np.sin(np.outer(time, (0.7, 1, 2)))
+    rates = [turn + random.normal(0, 0.003, turn.shape) for _ in range(3)]
+    strike(time, rates[1])
+    head = ",".join(["time", *(name.replace(".", "_") for name in UNITS)])
+    table = np.column_stack([time, *rates])
+    np.savetxt(path, table, "%.7f", delimiter=",", header=head, comments="")
+    return path
+
+
+def freeze(time, rates):
+    rates[time > 15] = rates[1500]
+
+
+def lose_values(time, rates):
+    rates[np.random.default_rng(0).random(len(time)) < 0.2, 1] = np.nan
+
+
+def oscillate(time, rates):
+    rates[:, 0] += np.where(time > 15, 0.5 * np.sin(2 * np.pi * 9 * time), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("strike", "sentence"),
+    [
+        (
+            freeze,
+            r"FAULTY: imu_1, all axes, from (15|16|17|18|19)\.\d s\. Reason: frozen: has repeated one",
+        ),
+        (lose_values, r"FAULTY: imu_1\.y from .*s\. Reason: its values come and go\.$"),
+        (
+            oscillate,
+            r"FAULTY: .* from 15.* ms\b.* imu_1\.x had noise .* as usual",
+        ),
+    ],
+)
+def test_the_verdict_names_what_is_wrong_and_not_what_was_doubted(
+    strike, sentence, fdi, tmp_path
+):
+    out = fdi("replay", three_units(tmp_path / "three.csv", strike)).out
+    assert re.match(sentence, out.splitlines()[0]), out
 
 
 # Deliveries and values
