@@ -313,7 +313,7 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
     """Check that samples with stamps (k,), ns, have the configured rate, Hz.
 
     `BagError` if both the median and the mean without gaps are off by more than
-    `RATE_TOLERANCE`: lost samples and bursts change only one of them. Fewer than 51
+    `RATE_TOLERANCE`: lost samples and bursts change only one. Fewer than 51
     stamps are not checked.
     """
     steps = np.sort(np.diff(stamp)) * 1e-9

@@ -12,7 +12,7 @@ simulation on the clock of its computer stamps with dates.
 
 pyulog keeps one object per message without samples and per announced field, retries
 byte by byte in damaged files, and prints. Its input is therefore cut off when a file
-holds more of these than any logger writes.
+holds more than any logger writes.
 """
 
 from __future__ import annotations
@@ -282,7 +282,7 @@ def _device(columns: Columns) -> int:
 
 
 def _forces_at(times: Int, columns: Columns) -> Columns:
-    """Interpolate the samples of an accelerometer at times (k,), us. NaN outside of them."""
+    """Interpolate the samples of an accelerometer at times (k,), us. NaN outside."""
     try:
         stamp, first = np.unique(_stamp(columns), return_index=True)
         force = _vectors(columns)[first]

@@ -4,7 +4,7 @@
 """Cache of compiled code on disk: where results lie, when they are valid, whose files are trusted.
 
 A result depends on the source of its function, on every module of this package which that source imports, on Numba,
-NumPy, the minor version of Python and the target processor. The key holds all of them, and neither path nor time: a
+NumPy, the minor version of Python and the target processor. The key holds them all, and neither path nor time: a
 copied or installed package finds its results, and a changed one never meets old results.
 
 The target is x86-64-v2 on processors of that level (all but the oldest), else the plain instruction set. So code that

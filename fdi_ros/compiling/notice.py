@@ -54,7 +54,7 @@ class _Watch(event.Listener):  # type: ignore[misc,unused-ignore]
         self.depth += 1
         if self.depth == 1:
             self.begun = time.perf_counter()
-            # Before the hooks: if one of them raises, `on_end` is called, too.
+            # Before the hooks: if one raises, `on_end` is called, too.
             young, *older = self.thresholds = gc.get_threshold()
             gc.set_threshold(max(young, YOUNG_OBJECTS) if young else 0, *older)
             for hook in tuple(self.hooks):

@@ -133,8 +133,8 @@ def confirm(decision: Decision, settings: PathSettings) -> tuple[int, int]:
     """Return the channels that the window declares faulty, and an undecided set.
 
     A channel is faulty if at least `alarms` of the last `window` samples suspected the
-    channel, and at least half as many of these alarms isolate their suspects. If the
-    alarms suffice but isolate no channel, the channels that at least half of them
+    channel, and at least half as many alarms isolate their suspects. If the
+    alarms suffice but isolate no channel, the channels that at least half
     suspected form the undecided set. The same holds if all samples of the window have
     alarms that disagree; if no channel is in half of `alarms` of them, all suspects
     form the set.

@@ -40,7 +40,7 @@ def fill_growth(
 ) -> None:
     """Write each channel's mean square error, in units of its noise_std^2, into growth (n,).
 
-    ``variance`` (n,) is that of the sample, (rad/s)^2. ``remaining`` (n,) is the
+    ``variance`` (n,) of the sample, (rad/s)^2. ``remaining`` (n,) is the
     standard deviation of each channel's unknown bias, rad/s. The correlation of the
     biases is unknown. An axis with gains G is off by up to ``sum |G_i| std(b_i)``, as
     by the nominal biases of Blanch et al. (2015). The square of this sum is at most n

@@ -75,7 +75,7 @@ def fill_joint_parity(
 ) -> None:
     """Calculate A and G for correlated errors.
 
-    ``covariance`` (n, n) is that of the errors, (rad/s)^2, and ``known`` the prior
+    ``covariance`` (n, n) of the errors, (rad/s)^2, and ``known`` the prior
     information k of the rate, s^2/rad^2.
     """
     n = sensors.n

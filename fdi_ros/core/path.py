@@ -354,7 +354,7 @@ def times_as_noisy(core: Core, i: int) -> float:
 
 @compiled
 def exceeds_others(core: Core, i: int, times: float) -> bool:
-    """Whether the noise of a channel has grown more than that of all other units."""
+    """Whether the noise of a channel has grown more than in all other units."""
     settings = core.settings
     own = unit_of(settings, i)
     for j in range(settings.n):

@@ -148,7 +148,7 @@ class Sample:
     """One sample of all units, three channels each."""
 
     stamp: Whole  # ns
-    shift: Whole  # stamp less that of the message, ns
+    shift: Whole  # stamp less the message's, ns
     z: Channels  # rates, rad/s, NaN where not received
     received: Flags  # by gyro
     force: Channels  # specific forces, m/s^2, NaN where not received
@@ -709,7 +709,7 @@ class Live:
     ready: Flag  # a sample is ready for the pipeline
     sample: Sample
     events: Whole  # of the last sample
-    shift: Whole  # stamp of the last sample less that of its message, ns
+    shift: Whole  # stamp of the last sample less its message's, ns
     without_rate: Whole  # samples
     last_stamp: Whole  # of the last array, ns
     clock_shift: Whole  # added to the stamps of arrays, ns

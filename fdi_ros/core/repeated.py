@@ -11,7 +11,7 @@ A fault at rest looks like motion to every quiet channel beside it. The others a
 therefore evidence of motion only if they agree. The same channels must have seen the
 whole motion, and their disagreement must be small beside the motion. The noise of a fine
 sensor never repeats. A channel that repeats values by habit is stuck only if no single
-one of the others can be the cause: without each of them, the rest must have measured the
+one of the others can be the cause: without each other one, the rest must have measured the
 motion too. An alarm that does not isolate the channel that repeats forbids the
 conclusion too.
 """
@@ -103,7 +103,7 @@ def fill_disagreement(
 def is_confirmed(
     core: Core, subsets: NDArray[Any], others: int, i: int, least: float
 ) -> bool:
-    """Return whether the others have measured motion along channel i, whichever of them is left out.
+    """Return whether the others have measured motion along channel i, whichever channel is left out.
 
     Each must have measured more than ``least``, rad/s, since channel i first had its value.
     """
@@ -194,7 +194,7 @@ def add_stuck(settings: PathSettings, now: Current, evidence: int) -> None:
 def update_repeated(core: Core) -> int:
     """Return the channels of units that repeat all their values while the others move.
 
-    Where every channel of a unit repeats values by habit, all of them may do so at once.
+    Where every channel of a unit repeats values by habit, all may do so at once.
     """
     members = core.settings.members
     sensors = core.settings.sensors

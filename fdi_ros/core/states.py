@@ -139,7 +139,7 @@ def update_states(core: Core, checked: int, suspicion: int, learning: bool) -> N
 
 @compiled
 def reason_of(core: Core, subset: Subset, i: int) -> int:
-    """Return the reason of a channel's state. ``subset`` is that of the living channels."""
+    """Return the reason of a channel's state. ``subset`` belongs to the living channels."""
     state = core.last.state[i]
     condition = core.health.condition[i]
     if state in (OK, EXCLUDED):

@@ -529,7 +529,7 @@ def square_of_mean(scale: Scale, i: int, count: int) -> float:
 def mean_step(scale: Scale, i: int, steps: int, without: int) -> float:
     """Return half the mean square of the last differences of channel i, without the largest ones.
 
-    ``without`` is the number of these, at most 2. White noise of variance one gives one.
+    ``without`` counts these, at most 2. White noise of variance one gives one.
     """
     squares = first = second = 0.0
     for k in range(steps):

@@ -509,7 +509,7 @@ def update_best(inference: Inference, n: int) -> None:
 def choose(inference: Inference, n: int, confidence: float) -> None:
     """Take the likeliest hypotheses until their odds add up to the confidence.
 
-    A channel that all of these hypotheses contain is faulty. If one hypothesis is a shift,
+    A channel in all these hypotheses is faulty. If one hypothesis is a shift,
     or a unit that measures motion wrongly, all gyros may be healthy and no channel is
     named.
     """

@@ -6,7 +6,7 @@
 ``z_i = (H omega)_i (1 + k_i) + b_i``, omega uniform in a cube, k and b of healthy channels normal and clipped at
 3 standard deviations. One channel, any, has ``k = sign(X1) ((D - 3) |X1| + 3) sigma_k`` and b alike, X uniform on
 -1 to 1. A trial is kept by the error ``dZ = |z - H omega|`` of the failed channel against the mean M and standard
-deviation s of those of the healthy ones: inside ``M - 3 s < dZ < M + 3 s`` as printed, or outside, a fault that stands
+deviation s over the healthy ones: inside ``M - 3 s < dZ < M + 3 s`` as printed, or outside, a fault that stands
 out.
 """
 

@@ -23,7 +23,7 @@ from fdi_ros.model.samples import Array
 from fdi_ros.report.layout import DEGREES
 from fdi_ros.system.text import figures, shown
 
-#: largest relative distance of a factor from that of a degree
+#: largest relative distance of a factor from a degree's
 NEAR = 0.2
 #: of the rates of a unit, that are compared with those of another
 QUANTILES = (

@@ -73,7 +73,7 @@ class Urdf:
     def mounts(self, frames: Sequence[str]) -> Array:
         """Return the mounts (n, 3, 3) of n links: v_first = mount v_link.
 
-        The body frame is that of the first link. `ConfigError` if a link is missing, or
+        The first link has the body frame. `ConfigError` if a link is missing, or
         moves against the first one.
         """
         places = [self._place(frame) for frame in frames]

@@ -242,7 +242,7 @@ class Geometry:
     def covariance(self, variance: ArrayLike = 1.0) -> Array:
         """Return the covariance (3, 3) of the least-squares rate, (rad/s)^2.
 
-        ``variance`` is that of the channels, scalar or (n,), (rad/s)^2.
+        ``variance`` of the channels: scalar or (n,), (rad/s)^2.
         """
         gain = self.least_squares
         return (

@@ -181,7 +181,7 @@ def failures(required: Sequence[Condition], judgement: Judgement) -> list[str]:
 
 
 def parse_check(text: str, faults: int, names: Sequence[str] = ()) -> list[Condition]:
-    """Read conditions separated by blanks or commas. All of them must hold.
+    """Read conditions separated by blanks or commas. All must hold.
 
     Parameters
     ----------

@@ -147,7 +147,7 @@ def notes(summary: Summary) -> list[str]:
 
 
 def sample_rate_notes(rate: SampleRate) -> list[str]:
-    """Return a line if the configured sample rate is not that of the recording."""
+    """Return a line if the configured sample rate differs from the recording's."""
     if rate.recorded_hz is None:
         return []
     if abs(rate.recorded_hz / rate.configured_hz - 1) <= RATE_TOLERANCE:

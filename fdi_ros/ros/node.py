@@ -326,7 +326,7 @@ class CheckedNode(Node):
         }
 
     def change(self, changes: Sequence[Parameter]) -> None:
-        """Take over parameters that are being set. Raise `FdiError` to refuse all of them."""
+        """Take over parameters that are being set. Raise `FdiError` to refuse all."""
 
     def _on_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         try:

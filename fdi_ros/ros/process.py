@@ -222,7 +222,7 @@ def _node_names(prefix: str, document: Any) -> Iterator[str]:
             yield prefix
 
 
-# What is installed as commands.
+# The installed commands.
 fdi_node = partial(run, "fdi_node")
 injector_node = partial(run, "injector_node")
 mavlink_node = partial(run, "mavlink_node")

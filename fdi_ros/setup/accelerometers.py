@@ -3,7 +3,7 @@
 
 """Noise, biases, scales and misalignments of accelerometers against each other.
 
-The estimate is that of the gyros (`fdi_ros.setup.estimate`) on specific forces over
+The estimate of the gyros (`fdi_ros.setup.estimate`) runs on specific forces over
 `FORCE.natural`, less what the turning of the body adds at known positions. Accelerometers
 are never at rest in its sense: gravity turns with the attitude, and rest, as the gyros
 show it, means a constant specific force. Rest in several attitudes and motion tell scale
@@ -66,7 +66,7 @@ class AccelerometerFit(ChannelFit):
 
     #: parameters to be changed, ``{"section.field": value}``
     settings: dict[str, object]
-    #: what the monitor declares of them in this recording
+    #: what the monitor declares in this recording
     faults: tuple[Any, ...] = ()
 
 

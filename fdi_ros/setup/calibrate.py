@@ -388,7 +388,7 @@ class _Watched(Kept):
 def _watch(
     block: Block, config: Config, names: Sequence[str], gyros: int
 ) -> tuple[tuple[Span, ...], Spectrum]:
-    """Return the declarations of the monitor of these channels, and the spectrum.
+    """Return the monitor's declarations on the channels, and the spectrum.
 
     The first ones are ``gyros``, the others accelerometers.
     """

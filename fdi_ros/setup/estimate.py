@@ -122,7 +122,7 @@ class Priors:
     bias_std: float
     #: s
     delay_std: float
-    #: (units,) expected delays of the stamps, s; that of the first is known
+    #: (units,) expected delays of the stamps, s; the first one's is known
     delay: Array
     rest: Mask | None = None
     """(W,) windows at rest, where the rate is constant and not known to be zero. None: the
@@ -277,7 +277,7 @@ class _Pass:
     ``delay`` (units,): taken off the blocks, s. ``axes`` (n, 3). ``biases`` (K, n): of
     joined windows, rad/s. ``known``: whether the biases have been refined by two
     passes.
-    ``colour`` (2, n): variance of longer means over that of white noise, at rest and in
+    ``colour`` (2, n): variance of longer means over white noise's, at rest and in
     motion.
     """
 
@@ -547,7 +547,7 @@ class _Pass:
         return np.asarray(np.swapaxes(np.linalg.solve(whole, moments), 1, 2))
 
     def nonlinearity(self, sensors: Priors, axes: Array, bias: Array) -> Nonlinearity:
-        """Measure what is not linear in the rate, with axes (n, 3) and mean biases (n,), rad/s."""
+        """Measure the nonlinearity in the rate, with axes (n, 3) and mean biases (n,), rad/s."""
         window = self.window
         # Only blocks in which no channel is absent.
         rows = self.used & ~self.rest[window] & self.present[window].all(axis=1)

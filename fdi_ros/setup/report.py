@@ -257,7 +257,7 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
 
 
 def _accelerometers(result: Calibration) -> Iterator[Finding]:
-    """Yield what is found of the accelerometers, and what is not."""
+    """Yield findings on the accelerometers, and what is missing."""
     if result.accelerometers is not None:
         yield from _found_forces(result.accelerometers)
         yield from _unknown_forces(result.accelerometers)
@@ -419,7 +419,7 @@ def _lost_words(result: Calibration) -> list[str]:
     words = []
     for why, count in result.unusable.items():
         usual = why in ("missing", "spikes")
-        # Of these, 1 % of the samples is worth a look.
+        # 1 % of the samples is worth a look.
         if count.max() <= (0.01 * found.blocks.count.sum() if usual else 0):
             continue
         called = "frozen" if why == "repeated" else why.replace("_", " ")

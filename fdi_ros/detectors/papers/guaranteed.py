@@ -97,7 +97,7 @@ def _scatter(index: NDArray[np.intp], values: Array, n: int) -> Array:
 
 
 def _contains(rows: Array, smaller: Array) -> NDArray[np.bool_]:
-    """Return for each row whether its support contains that of a smaller circuit."""
+    """Return for each row whether its support contains a smaller circuit's."""
     support = (rows != 0).astype(np.int64)
     small = (smaller != 0).astype(np.int64)
     contains: NDArray[np.bool_] = (support @ small.T == small.sum(axis=1)).any(axis=1)
@@ -148,7 +148,7 @@ class Circuits:
     # [i, f]: number of circuits through channel i without other members in set f: only
     # healthy members limit the error of channel i
     usable: Annotated[NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS)]
-    # [i, f]: indices of these circuits in circuit[i]
+    # [i, f]: indices into circuit[i]
     which: Annotated[NDArray[np.uint8], "u1", (MOST_CHANNELS, MOST_SETS, MOST_LIMITS)]
 
 
@@ -258,7 +258,7 @@ def intervals(params: Circuits, found: Findings) -> None:
 def name_suspects(params: Circuits, found: Findings, verdict: SampleVerdict) -> None:
     """Write the channels that failed in some explanation, and their errors.
 
-    The verdict isolates if all of them failed in each explanation.
+    The verdict isolates if all failed in each explanation.
     """
     n = params.sensors.n
     any_found = False
@@ -439,7 +439,7 @@ class Guaranteed(Detector):
         params["members"][: len(largest), : self.max_faults] = largest
 
     def _prepare_intervals(self, checks: Array) -> None:
-        """Write how circuits limit each channel's error, and which of them do for each set."""
+        """Write how circuits limit each channel's error, and which circuits do for each set."""
         params = self.constants[0]
         for i, bound in enumerate(self.bound):
             through = np.flatnonzero(checks[:, i])

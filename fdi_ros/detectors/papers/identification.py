@@ -107,7 +107,7 @@ class Projector(SingleFaultDetector):
     channels.
 
     ``scores`` are J(k) or ``|e_k|``. The statistic is ``|kappa_k|`` of the named channel
-    over its standard deviation. The largest of these over all channels exceeds the threshold
+    over its standard deviation. The largest one over all channels exceeds the threshold
     with the required false-alarm probability. For `l1` or unequal noise the threshold is an
     upper bound. docs/methods.md states when to use this method.
 

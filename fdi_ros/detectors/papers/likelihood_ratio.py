@@ -174,7 +174,7 @@ def fill_scratch(
 def leave_out(
     params: Hypotheses, n: int, room: Scratch, a: int, b: int, c: int
 ) -> None:
-    """Write the residuals without channels a, b and c to `kept`, and the errors of these.
+    """Write the residuals without channels a, b and c to `kept`, and their errors.
 
     b and c may be -1: none. Errors are in the places of their channels.
     """
@@ -381,7 +381,7 @@ def explain_by_pairs(
         room.misfit[i] = math.inf
     for i in range(n):
         for j in range(i + 1, n):
-            # Two indistinguishable channels explain no more than one of them.
+            # Two indistinguishable channels explain no more than one alone.
             if (
                 sensors.detectable[i]
                 and sensors.detectable[j]

@@ -39,7 +39,7 @@ class ResidualSearch(SingleFaultDetector):
     With the tolerance ``paper``, eq. (8), the statistic is ``|z_i - z_ip|``, rad/s, of the
     worst channel, and the threshold ``3 sqrt(sigma_0^2 + sigma_k^2 z_ip^2)``. With
     ``calibrated`` the statistic is divided by its standard deviation, prediction included.
-    The largest of these over all channels exceeds the threshold with the required
+    The largest one over all channels exceeds the threshold with the required
     false-alarm probability. docs/methods.md states when to use which.
 
     Parameters

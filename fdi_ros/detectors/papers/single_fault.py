@@ -110,7 +110,7 @@ class SingleFaultDetector(Detector):
     fault.
 
     Unless a method has its own, the statistic is ``|z_i - z_ip|`` of the named channel over
-    its standard deviation. The largest of these over all channels exceeds the threshold with
+    its standard deviation. The largest one over all channels exceeds the threshold with
     the false-alarm probability.
 
     Parameters
@@ -301,7 +301,7 @@ class WithForms(SingleFault):
     forms: Annotated[
         NDArray[np.float64], "f8", (MAX_CHANNELS - 1, MAX_CHANNELS, MAX_CHANNELS)
     ]
-    paper: Flag  # the tolerance of a residual search is that of its paper
+    paper: Flag  # a residual search has the tolerance of its paper
 
 
 def set_forms(params: Any, forms: Array, squares: bool = False) -> None:
