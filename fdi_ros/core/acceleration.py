@@ -35,10 +35,10 @@ def differentiate_rate(
         <= stamp - acceleration.window
     ):
         note_known(acceleration, acceleration.oldest + 1)
-    if acceleration.has_known and math.isfinite(rate[0]):
-        seconds = (stamp - acceleration.known.stamp) * 1e-9
+    if acceleration.has_last_rate and math.isfinite(rate[0]):
+        seconds = (stamp - acceleration.last_rate.stamp) * 1e-9
         for a in range(3):
-            acceleration.value[a] = (rate[a] - acceleration.known.rate[a]) / seconds
+            acceleration.value[a] = (rate[a] - acceleration.last_rate.rate[a]) / seconds
 
 
 @compiled
@@ -47,7 +47,7 @@ def note_known(acceleration: Acceleration, oldest: int) -> None:
     acceleration.oldest = oldest
     one = acceleration.history[oldest % ACCELERATION_SAMPLES]
     if math.isfinite(one.rate[0]):
-        acceleration.has_known = 1
-        acceleration.known.stamp = one.stamp
+        acceleration.has_last_rate = 1
+        acceleration.last_rate.stamp = one.stamp
         for a in range(3):
-            acceleration.known.rate[a] = one.rate[a]
+            acceleration.last_rate.rate[a] = one.rate[a]

@@ -225,7 +225,7 @@ def begin_in_motion(average: Bias, n: int) -> None:
     average.outcome = IN_MOTION
     for i in range(n):
         average.value[i] = average.centre[i]
-    average.known = (1 << n) - 1
+    average.channels_known = (1 << n) - 1
 
 
 @compiled
@@ -259,7 +259,7 @@ def conclude(core: Core, subsets: NDArray[Any], lost: int) -> None:
         for i in range(n):
             if at_rest >> i & 1:
                 average.value[i] = average.average[i]
-        average.known = at_rest | lost
+        average.channels_known = at_rest | lost
         average.learning = False
         average.outcome = LEARNED
     else:

@@ -38,10 +38,10 @@ LEAST_NOISE = 0.02
 
 @compiled
 def update_copies(
-    copies: Copies, settings: PathSettings, line: DelayBuffer, stamp: int
+    copies: Copies, settings: PathSettings, buffer: DelayBuffer, stamp: int
 ) -> None:
     """Compare all pairs of units once in `PERIOD`. ``copies.found`` is set for a new copy."""
-    if stamp - copies.stamp < PERIOD or line.count < ROWS + 3:
+    if stamp - copies.stamp < PERIOD or buffer.count < ROWS + 3:
         return
     copies.stamp = stamp
     for a in range(settings.units):
@@ -49,7 +49,7 @@ def update_copies(
             if (
                 copies.original[a]
                 or copies.original[b]
-                or not is_copy(copies, settings, line, a, b)
+                or not is_copy(copies, settings, buffer, a, b)
             ):
                 continue
             copies.hits[a, b] += 1
@@ -61,20 +61,20 @@ def update_copies(
 
 @compiled
 def is_copy(
-    copies: Copies, settings: PathSettings, line: DelayBuffer, a: int, b: int
+    copies: Copies, settings: PathSettings, buffer: DelayBuffer, a: int, b: int
 ) -> bool:
     """Return whether one of two units delivers present or earlier values of the other."""
     first = first_of_three(settings.members[a])
     second = first_of_three(settings.members[b])
     if first < 0 or second < 0:
         return False
-    for lag in range(min(MAX_LAG, min(line.count, RESTAMP_SAMPLES) - ROWS - 2) + 1):
+    for lag in range(min(MAX_LAG, min(buffer.count, RESTAMP_SAMPLES) - ROWS - 2) + 1):
         for turned in range(2):
             source, target = (second, first) if turned else (first, second)
             agrees = True
             for wanted in (FEW, ROWS):
                 agrees = agrees and sum_changes(
-                    copies, line, source, target, lag, wanted
+                    copies, buffer, source, target, lag, wanted
                 )
                 agrees = agrees and is_explained(copies, settings, target, wanted)
             if agrees:
@@ -93,7 +93,7 @@ def first_of_three(members: int) -> int:
 
 @compiled
 def sum_changes(
-    copies: Copies, line: DelayBuffer, source: int, target: int, lag: int, wanted: int
+    copies: Copies, buffer: DelayBuffer, source: int, target: int, lag: int, wanted: int
 ) -> bool:
     """Sum the products of the changes of two units to ``copies.products``.
 
@@ -117,12 +117,12 @@ def sum_changes(
     for i in range(6):
         for j in range(6):
             products[i, j] = 0.0
-    newest = line.count - 1
-    oldest = max(line.count - RESTAMP_SAMPLES, 0)
+    newest = buffer.count - 1
+    oldest = max(buffer.count - RESTAMP_SAMPLES, 0)
     for k in range(newest, max(newest - 2 * wanted, oldest + lag + 1), -1):
         if not (
-            fill_change(line, source, k - lag, change, 0)
-            and fill_change(line, target, k, change, 3)
+            fill_change(buffer, source, k - lag, change, 0)
+            and fill_change(buffer, target, k, change, 3)
         ):
             continue
         count += change[3] != 0.0 or change[4] != 0.0 or change[5] != 0.0
@@ -135,14 +135,16 @@ def sum_changes(
 
 
 @compiled
-def fill_change(line: DelayBuffer, first: int, k: int, out: Array, place: int) -> bool:
+def fill_change(
+    buffer: DelayBuffer, first: int, k: int, out: Array, place: int
+) -> bool:
     """Write second differences of three channels up to sample k to ``out``.
 
     Return whether all values are finite and in range.
     """
-    new = line.rows[k % RESTAMP_SAMPLES]
-    middle = line.rows[(k - 1) % RESTAMP_SAMPLES]
-    old = line.rows[(k - 2) % RESTAMP_SAMPLES]
+    new = buffer.rows[k % RESTAMP_SAMPLES]
+    middle = buffer.rows[(k - 1) % RESTAMP_SAMPLES]
+    old = buffer.rows[(k - 2) % RESTAMP_SAMPLES]
     for i in range(3):
         out[place + i] = (
             new.values[first + i]
@@ -190,11 +192,11 @@ def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
     Each series has shape (N, 3), in rad/s, and all have the same sample rate.
     """
     found = []
-    line = allocate(DelayBuffer)
+    buffer = allocate(DelayBuffer)
     copies = allocate(Copies)
     settings = allocate(PathSettings)
     settings["members"][0, :2] = 0b111, 0b111000
-    rows = line["rows"][0]
+    rows = buffer["rows"][0]
     for a, b in itertools.combinations(range(len(series)), 2):
         size = min(len(series[a]), len(series[b]), RESTAMP_SAMPLES)
         if size < ROWS + 3:
@@ -204,8 +206,8 @@ def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
         rows["plain"][:size] = (np.abs(values) < MAX_RATE) @ (1 << np.arange(6))
         hits = 0
         for count in (size, size * 3 // 4, size // 2):
-            line["count"] = max(count, ROWS + 3)
-            hits += is_copy(copies[0], settings[0], line[0], 0, 1)
+            buffer["count"] = max(count, ROWS + 3)
+            hits += is_copy(copies[0], settings[0], buffer[0], 0, 1)
         if hits >= HITS:
             found.append((a, b))
     return found

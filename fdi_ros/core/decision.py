@@ -32,7 +32,7 @@ WHY = ("", "disagrees", "stuck", "non-finite", "drifted", "intermittent")
 def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bool:
     """Process the evidence of one sample. Return whether the declarations changed."""
     suspected = evidence.suspected & ~decision.faulty
-    counted = 0 if evidence.held else suspected
+    counted = 0 if evidence.no_votes else suspected
     doubtful = suspected | evidence.outliers & ~decision.faulty
     push(
         decision,

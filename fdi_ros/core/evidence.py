@@ -38,7 +38,7 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     evidence.judged = not math.isnan(now.verdict.statistic)
     evidence.checked = subsets[core.sample.mask].detectable if evidence.judged else 0
     evidence.checked &= core.sample.estimate.checked
-    evidence.held = core.sample.held
+    evidence.no_votes = core.sample.in_recovery
     evidence.broken = evidence.repeats = evidence.agrees = clear = 0
     may_return = not settings.latch and core.decision.faulty != 0
     for i in range(settings.n):
@@ -78,7 +78,7 @@ def fill_suspects(core: Core, stuck: int) -> None:
     evidence.certain = 0
     evidence.undecided = 0
     evidence.outliers = bits_of(verdict.outliers, n) | now.repeated | evidence.flickers
-    if settings.by_evidence and verdict.alarm and not evidence.held:
+    if settings.by_evidence and verdict.alarm and not evidence.no_votes:
         if verdict.isolated:
             evidence.certain = bits_of(verdict.suspects, n)
         else:
@@ -103,7 +103,7 @@ def update_drifted(settings: PathSettings, sample: SampleInput, now: Current) ->
     """Find channels whose bias certainly exceeds ``max_drift``, and add them as suspects."""
     now.evidence.drifted = 0
     estimate = sample.estimate
-    if settings.max_drift > 0.0 and estimate.known:
+    if settings.max_drift > 0.0 and estimate.is_current:
         for i in range(settings.n):
             bias = abs(estimate.bias[i]) - SURE_DRIFT * estimate.bias_std[i]
             if sample.mask >> i & 1 and bias > settings.max_drift:

@@ -59,7 +59,9 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         # The rate is stated for the instant of the earliest unit. The true instant lies
         # between those of the earliest and the latest unit.
         for a in range(3):
-            now.doubt[a] = core.sample.estimate.spread * core.acceleration.value[a]
+            now.doubt[a] = (
+                core.sample.estimate.largest_delay * core.acceleration.value[a]
+            )
         add_square(last.covariance, now.doubt, 1.0 / 3.0)
         update_common_error(core)
     else:
@@ -134,7 +136,7 @@ def update_gain(
     sensors = settings.sensors
     for i in range(n):
         now.variance[i] = estimate.variance[i]
-        if not estimate.known:
+        if not estimate.is_current:
             # The sample was not judged: the estimate belongs to an earlier motion.
             rate_along = along(sensors.axes[i], now.plain_rate)
             expected = variance_of(sensors, i, rate_along, acceleration.value)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.records import Condition, Core, Health, PathSettings, Sample
-from fdi_ros.model.samples import Array
+from fdi_ros.model.samples import LARGEST_GYRO_RANGE, Array
 
 FINE, MISSING, NON_FINITE, OUT_OF_RANGE, FROZEN, SILENT, NON_FINITE_LASTING = map(
     int, Condition
@@ -147,8 +147,6 @@ RAIL_SHARE, RAIL_OFFSET = 1e-3, 0.02
 the end: sensitivities of makes differ, and a bias may have been subtracted."""
 #: Equal largest values in a row that show the end of a range. Noise repeats no extreme.
 RAIL_REPEATS = 3
-#: A larger max_rate belongs to a chip of more than 2000 deg/s, rad/s.
-UNKNOWN_RANGE = 36.0
 
 
 @compiled
@@ -165,7 +163,7 @@ def rail_of(size: float) -> float:
 def usual_limit(settings: PathSettings, i: int) -> float:
     """Return the size from which on values are out of range by the settings, rad/s."""
     stated = settings.max_rate[i]
-    return min(stated, rail_of(RANGES[3])) if stated < UNKNOWN_RANGE else stated
+    return min(stated, rail_of(RANGES[3])) if stated < LARGEST_GYRO_RANGE else stated
 
 
 @compiled

@@ -71,7 +71,7 @@ def judge_sample(
             judged.error[k] = judged.noise[k] = 0.0
             judged.scores[k] = math.nan if bank.takes_any else 0.0
             k += 1
-    judged.alarm = judged.isolated = sample.estimate.known = False
+    judged.alarm = judged.isolated = sample.estimate.is_current = False
     call(
         bank.judge,
         bank.constants,

@@ -35,10 +35,10 @@ from fdi_ros.model.samples import Array
 
 
 @compiled
-def fill_growth(
-    n: int, noise_std: Array, variance: Array, remaining: Array, growth: Array
+def fill_error_ratio(
+    n: int, noise_std: Array, variance: Array, remaining: Array, error_ratio: Array
 ) -> None:
-    """Write each channel's mean square error, in units of its noise_std^2, into growth (n,).
+    """Write the mean square error of each channel over noise_std^2 into error_ratio (n,).
 
     ``variance`` (n,) of the sample, (rad/s)^2. ``remaining`` (n,) is the
     standard deviation of each channel's unknown bias, rad/s. The correlation of the
@@ -47,14 +47,16 @@ def fill_growth(
     times the square for independent biases.
     """
     for i in range(n):
-        growth[i] = (variance[i] + n * remaining[i] * remaining[i]) / (
+        error_ratio[i] = (variance[i] + n * remaining[i] * remaining[i]) / (
             noise_std[i] * noise_std[i]
         )
 
 
 @compiled
-def fill_level(subset: Subset, n: int, mask: int, growth: Array, level: Array) -> None:
-    """Write the protection level (3,) of the channels in mask, rad/s, for the growth (n,).
+def fill_level(
+    subset: Subset, n: int, mask: int, error_ratio: Array, level: Array
+) -> None:
+    """Write the protection level (3,) of the channels in mask for error_ratio (n,), rad/s.
 
     For fixed shares of the risk, the level is the largest of several functions that are
     concave in the variances and homogeneous of degree 1/2. The tangent to each function
@@ -66,13 +68,13 @@ def fill_level(subset: Subset, n: int, mask: int, growth: Array, level: Array) -
     most = 0.0
     for i in range(n):
         if mask >> i & 1:
-            least = min(least, growth[i])
-            most = max(most, growth[i])
+            least = min(least, error_ratio[i])
+            most = max(most, error_ratio[i])
     for a in range(3):
         total = least
         for i in range(n):
             if mask >> i & 1:
-                total += subset.share[i, a] * (growth[i] - least)
+                total += subset.share[i, a] * (error_ratio[i] - least)
         level[a] = subset.level[a] * math.sqrt(min(total, most))
 
 
@@ -83,7 +85,7 @@ def passes_test(
     noise_std: Array,
     n: int,
     mask: int,
-    growth: Array,
+    error_ratio: Array,
     residual: Array,
 ) -> bool:
     """Return whether the residuals (n,) of the channels in mask pass the separation test.
@@ -94,7 +96,7 @@ def passes_test(
     least = math.inf
     for i in range(n):
         if mask >> i & 1:
-            least = min(least, growth[i])
+            least = min(least, error_ratio[i])
     for i in range(n):
         # In most samples this cheap bound decides.
         if mask >> i & 1 and not abs(residual[i]) <= subset.limit[i] * math.sqrt(least):
@@ -104,7 +106,7 @@ def passes_test(
                     taken = along(axes[i], subset.gain[j])
                     part = ((1.0 if i == j else 0.0) - taken) * noise_std[j]
                     before += part * part
-                    after += part * part * growth[j]
+                    after += part * part * error_ratio[j]
             if not abs(residual[i]) <= subset.limit[i] * math.sqrt(after / before):
                 passes = False
     return passes
@@ -261,10 +263,18 @@ def update_level(core: Core, subsets: NDArray[Any]) -> None:
     core.wanted = now.fused if passes and not subset.has_level else 0
     n = core.settings.n
     sensors = core.settings.sensors
-    fill_growth(n, sensors.noise_std, now.variance, core.remaining, now.growth)
-    fill_level(subset, n, now.fused, now.growth, last.level)
+    fill_error_ratio(
+        n, sensors.noise_std, now.variance, core.remaining, now.error_ratio
+    )
+    fill_level(subset, n, now.fused, now.error_ratio, last.level)
     if not passes or not passes_test(
-        subset, sensors.axes, sensors.noise_std, n, now.fused, now.growth, now.tested
+        subset,
+        sensors.axes,
+        sensors.noise_std,
+        n,
+        now.fused,
+        now.error_ratio,
+        now.tested,
     ):
         for a in range(3):
             last.level[a] = math.inf
@@ -276,7 +286,7 @@ def update_level(core: Core, subsets: NDArray[Any]) -> None:
             last.level[a] += abs(last.rate[a] - now.plain_rate[a]) + abs(now.lagging[a])
             last.level[a] += core.settings.reach * common
             # The units measure at different instants, and each may be the right one.
-            apart = core.sample.estimate.spread * core.acceleration.value[a]
+            apart = core.sample.estimate.largest_delay * core.acceleration.value[a]
             last.level[a] += abs(apart)
         if core.settings.risk > 0.0 and core.decision.faulty | core.decision.ambiguous:
             cover_rivals(core)

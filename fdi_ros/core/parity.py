@@ -25,23 +25,27 @@ UNKNOWN_RATE = 1.0 / MAX_RATE**2
 
 
 @compiled
-def update_normal(parity: Parity, n: int, axes: Array, known: float) -> None:
+def update_normal(
+    parity: Parity, n: int, axes: Array, prior_information: float
+) -> None:
     """Calculate W H, and the lower triangle of ``H' W H + K``."""
     for i in range(n):
         for a in range(3):
             parity.weighted[i, a] = dot(parity.weight[i], axes[:, a], n)
     for a in range(3):
         for b in range(a + 1):
-            total = known if a == b else 0.0
+            total = prior_information if a == b else 0.0
             for i in range(n):
                 total += axes[i, a] * parity.weighted[i, b]
             parity.normal[a, b] = total
 
 
 @compiled
-def eliminate_rate(parity: Parity, n: int, axes: Array, known: float) -> None:
-    """Calculate A and G from W. ``known`` is the prior information k, s^2/rad^2."""
-    update_normal(parity, n, axes, known)
+def eliminate_rate(
+    parity: Parity, n: int, axes: Array, prior_information: float
+) -> None:
+    """Calculate A and G from W. ``prior_information`` is k, s^2/rad^2."""
+    update_normal(parity, n, axes, prior_information)
     invert(parity.normal, 3, parity.inverse)
     for a in range(3):
         for i in range(n):
@@ -71,11 +75,15 @@ def fill_parity(parity: Parity, sensors: Sensors, mask: int, variance: Array) ->
 
 @compiled
 def fill_joint_parity(
-    parity: Parity, sensors: Sensors, mask: int, covariance: Array, known: float
+    parity: Parity,
+    sensors: Sensors,
+    mask: int,
+    covariance: Array,
+    prior_information: float,
 ) -> None:
     """Calculate A and G for correlated errors.
 
-    ``covariance`` (n, n) of the errors, (rad/s)^2, and ``known`` the prior
+    ``covariance`` (n, n) of the errors, (rad/s)^2, and ``prior_information`` the prior
     information k of the rate, s^2/rad^2.
     """
     n = sensors.n
@@ -96,7 +104,7 @@ def fill_joint_parity(
     for p in range(count):
         for q in range(count):
             parity.weight[parity.place[p], parity.place[q]] = parity.information[p, q]
-    eliminate_rate(parity, n, sensors.axes, known)
+    eliminate_rate(parity, n, sensors.axes, prior_information)
 
 
 @compiled

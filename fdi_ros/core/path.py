@@ -222,7 +222,7 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     core.samples += 1
     check(settings, core.health, sample)
     plain, fine = bring_together(core, sample)
-    update_copies(core.copies, settings, core.line, stamp)
+    update_copies(core.copies, settings, core.delay_buffer, stamp)
     now.learned_from = False
     if core.bias.learning:
         learn_bias(path, stamp, plain)
@@ -242,7 +242,7 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     given.out = out
     given.interrupted = now.evidence.interrupted
     given.beyond = given.mask & ~now.usable
-    given.held = (
+    given.in_recovery = (
         core.saturated and stamp - core.saturated_stamp <= settings.recovery_time
     )
     now.repeated = update_repeated(core)
@@ -271,7 +271,7 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
         if core.health.condition[i] == FINE:
             fine |= 1 << i
     delivered = restamp(
-        core.line,
+        core.delay_buffer,
         settings,
         core.sample.estimate.late,
         sample,
@@ -308,7 +308,7 @@ def apply_estimate(core: Core) -> None:
     """Correct ``now.corrected`` with the present estimate of the sensor errors."""
     now = core.now
     estimate = core.sample.estimate
-    for i in range(core.settings.n if estimate.known else 0):
+    for i in range(core.settings.n if estimate.is_current else 0):
         if math.isfinite(now.input[i]):
             now.corrected[i] = estimate.corrected[i]
             if now.usable >> i & 1:

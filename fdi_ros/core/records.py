@@ -176,7 +176,7 @@ class Sensors:
 class Estimate:
     """Estimated errors of the sensors in one sample."""
 
-    known: Flag  # the other fields belong to this sample
+    is_current: Flag  # the other fields belong to this sample
     checked: Mask  # channels whose uncertainty hides no fault
     corrected: Channels  # values less their estimated errors, rad/s
     variance: Channels  # of the present noise, (rad/s)^2
@@ -188,7 +188,7 @@ class Estimate:
     bias_std: Channels  # standard deviation of `bias`, rad/s
     late: Units  # certain delay of the stamps of each unit, s, which `restamp` corrects
     behind: Real  # time from measurement to stamp, if the earliest unit is not late, s
-    spread: Real  # largest delay between units, s
+    largest_delay: Real  # largest delay between units, s
     spikes: Counts  # short outliers of each channel so far, left out of the rate
 
 
@@ -214,7 +214,8 @@ class SampleInput:
     # standard deviation of the positions, m over the natural size of the quantity
     position_std: Channels
     interrupted: Flag  # a hole in the stream precedes this sample
-    held: Flag  # a manoeuvre has just driven a channel out of range: evidence is void
+    # a manoeuvre has just driven a channel out of range: evidence is void
+    in_recovery: Flag
     repeated: Flag  # a unit repeats old values while the others move: no evidence
     wants_excess: Flag  # another method is to judge the corrected values
     estimate: Estimate  # written by the estimator, valid until the next sample
@@ -375,7 +376,8 @@ class Bias:
 
     given: Flag  # by the settings
     value: Channels  # subtracted from each channel, rad/s
-    known: Mask  # channels with a valid bias; the others were silent or restless
+    # channels with a valid bias; the others were silent or restless
+    channels_known: Mask
     duration: Whole  # of the average, ns
     centre: Channels  # expected average, rad/s
     max_rate: Real  # mean at rest, rad/s
@@ -448,8 +450,8 @@ class Acceleration:
     oldest: Whole  # number of the sample at the start of the difference
     # by number of the sample, modulo `ACCELERATION_SAMPLES`
     history: Annotated[list[TimedRate], ACCELERATION_SAMPLES]
-    known: TimedRate  # last rate up to the oldest sample
-    has_known: Whole  # 1 if `known` is valid
+    last_rate: TimedRate  # last rate up to the oldest sample
+    has_last_rate: Whole  # 1 if `last_rate` is valid
     value: Vector  # rad/s^2, zero if unknown
 
 
@@ -489,7 +491,7 @@ class Evidence:
     undecided: Mask  # a set that contains a faulty one, by accumulated evidence
     drifted: Mask  # channels whose bias is certainly beyond `max_drift`
     judged: Flag  # the method gave a verdict
-    held: Flag  # an alarm is suspicion only and counts towards no declaration
+    no_votes: Flag  # an alarm is suspicion only and counts towards no declaration
     interrupted: Flag  # a hole in the stream precedes this sample
     checked: Mask  # channels whose fault would have shown
     agrees: Mask  # channels that agree with the others, used for declared ones
@@ -647,7 +649,7 @@ class Current:
     common: Symmetric  # covariance of the rate from the estimated errors, (rad/s)^2
     lagging: Vector  # change of the rate up to the stated instant, rad/s
     plain_rate: Vector  # of the fused channels with expected weights, rad/s
-    growth: Channels  # error variance with the remaining bias, in noise_std^2
+    error_ratio: Channels  # error variance with the remaining bias, in noise_std^2
     guard: SampleVerdict  # of the estimator's own detector
     verdict: SampleVerdict  # of the method that declares
     scaled: Channels  # corrected values, residuals scaled to the expected noise, rad/s
@@ -662,7 +664,7 @@ class Core:
     settings: PathSettings
     health: Health
     bias: Bias
-    line: DelayBuffer
+    delay_buffer: DelayBuffer
     copies: Copies
     sample: SampleInput  # input of the estimator and its detector, with the estimate
     # rate at the last new value of each unit, rad/s

@@ -20,7 +20,7 @@ from fdi_ros.model.samples import Array
 
 @compiled
 def restamp(
-    line: DelayBuffer,
+    buffer: DelayBuffer,
     settings: PathSettings,
     late: Units,
     sample: Sample,
@@ -50,16 +50,18 @@ def restamp(
     units = settings.units
     members = settings.members
     stamp = sample.stamp
-    row = line.rows[line.count % RESTAMP_SAMPLES]
-    if line.count > 0:
-        step = stamp - line.rows[(line.count - 1) % RESTAMP_SAMPLES].stamp
-        line.step = (
-            step if line.step == 0 else min(step, line.step + (line.step >> 4) + 1)
+    row = buffer.rows[buffer.count % RESTAMP_SAMPLES]
+    if buffer.count > 0:
+        step = stamp - buffer.rows[(buffer.count - 1) % RESTAMP_SAMPLES].stamp
+        buffer.step = (
+            step
+            if buffer.step == 0
+            else min(step, buffer.step + (buffer.step >> 4) + 1)
         )
     row.stamp = stamp
     row.received = received
     row.plain = plain
-    line.count += 1
+    buffer.count += 1
     top = 0.0
     for u in range(units):
         top = max(top, late[u])
@@ -70,37 +72,39 @@ def restamp(
         back = round(1e9 * (top - late[u]))
         if back > 0:
             found &= ~members[u]
-            found |= interpolate(line, n, members[u], stamp - back, out)
+            found |= interpolate(buffer, n, members[u], stamp - back, out)
     return found
 
 
 @compiled
-def interpolate(line: DelayBuffer, n: int, members: int, stamp: int, out: Array) -> int:
+def interpolate(
+    buffer: DelayBuffer, n: int, members: int, stamp: int, out: Array
+) -> int:
     """Interpolate some channels at a stamp. Return the mask of the channels with a value.
 
     The interpolation is cubic through two samples before and two after the stamp. If one
     of the outer samples is missing or not yet received, the interpolation is linear.
     Between a value in range and one out of range or missing, no value exists.
     """
-    k = line.count - 1
-    oldest = max(line.count - RESTAMP_SAMPLES, 0)
-    while k > oldest and line.rows[k % RESTAMP_SAMPLES].stamp > stamp:
+    k = buffer.count - 1
+    oldest = max(buffer.count - RESTAMP_SAMPLES, 0)
+    while k > oldest and buffer.rows[k % RESTAMP_SAMPLES].stamp > stamp:
         k -= 1
-    before = line.rows[k % RESTAMP_SAMPLES]
-    after = line.rows[(k + 1) % RESTAMP_SAMPLES]
+    before = buffer.rows[k % RESTAMP_SAMPLES]
+    after = buffer.rows[(k + 1) % RESTAMP_SAMPLES]
     span = after.stamp - before.stamp
     found = members & before.received & after.received & ~(before.plain ^ after.plain)
-    if k + 1 >= line.count or before.stamp > stamp or span > MAX_STEPS * line.step:
+    if k + 1 >= buffer.count or before.stamp > stamp or span > MAX_STEPS * buffer.step:
         found = 0
     share = (stamp - before.stamp) / max(span, 1)
-    first = line.rows[(k - 1) % RESTAMP_SAMPLES]
-    last = line.rows[(k + 2) % RESTAMP_SAMPLES]
+    first = buffer.rows[(k - 1) % RESTAMP_SAMPLES]
+    last = buffer.rows[(k + 2) % RESTAMP_SAMPLES]
     curved = 0
     if (
         found
         and k - 1 >= oldest
-        and k + 2 < line.count
-        and last.stamp - first.stamp <= 2.0 * MAX_STEPS * line.step
+        and k + 2 < buffer.count
+        and last.stamp - first.stamp <= 2.0 * MAX_STEPS * buffer.step
     ):
         outer = ~(first.plain ^ before.plain) & ~(last.plain ^ before.plain)
         curved = found & first.received & last.received & outer

@@ -98,7 +98,7 @@ def left_out(core: Core) -> int:
 @compiled
 def out_of_use(core: Core) -> int:
     """Return the mask of channels left out, or of unknown bias."""
-    return left_out(core) | ~core.bias.known
+    return left_out(core) | ~core.bias.channels_known
 
 
 @compiled
@@ -158,7 +158,7 @@ def why_unchecked(core: Core, subset: Subset, i: int) -> int:
     """Return the reason why a channel is not checked."""
     if core.copies.channels >> i & 1:
         return _COPY
-    if core.bias.learning or not core.bias.known >> i & 1:
+    if core.bias.learning or not core.bias.channels_known >> i & 1:
         return _BIAS
     if core.now.all_repeat:
         return _ALL_REPEAT

@@ -92,7 +92,8 @@ OTHERS, TURNED = 6.0, 0.3
 """Largest rest of a healthy channel in a block, after the errors of the named channels: this
 many standard deviations, which noise does not reach in a flight, plus this share of the
 named error, because the axes are not exactly known."""
-ALIKE = 1e-3  # least share of the variance of a channel that others do not explain
+# least share of the variance of a channel that others do not explain
+MIN_INDEPENDENT_SHARE = 1e-3
 WARMS = 30.0
 """Time within which all biases may move by `LARGEST_MOVES` without a fault, s: the sensors
 warm, rectify vibration, or feel a boost begin and end."""
@@ -129,7 +130,7 @@ LONGEST_DRIFT = WARMS * (1 << DRIFT_TIMES)
 # time after a gap before the mean starts anew, s: equal to the time that a name must stand
 LEAST_RETURN = 0.2
 # peak rate of a move over its mean rate: warming is fastest at the beginning
-FASTEST = 2.5
+LARGEST_RATE_RATIO = 2.5
 
 
 @record
@@ -352,7 +353,7 @@ def block_shows_others(params: Constants, state: State, named: int, place: int) 
                 return False
             fill_correlations(information, i, named, inference.matrix[count])
             # The matrix of channels that look alike is singular.
-            inference.matrix[count, count] += ALIKE
+            inference.matrix[count, count] += MIN_INDEPENDENT_SHARE
             count += 1
     invert(inference.matrix, count, inference.inverse)
     for j in range(n):
@@ -364,7 +365,7 @@ def block_shows_others(params: Constants, state: State, named: int, place: int) 
                 share = dot(inference.inverse[p], inference.along, count)
                 inference.amplitude[p] = share
                 variance -= share * inference.along[p]
-            if variance > ALIKE and shows_other(
+            if variance > MIN_INDEPENDENT_SHARE and shows_other(
                 params, state, named, j, place, variance
             ):
                 return True
@@ -717,7 +718,7 @@ def goes_too_far(params: Constants, state: State) -> bool:
         )
         if far or (
             0 <= feeds[r] < params.sensors.n
-            and abs(kf.states.x[r]) * WARMS > FASTEST * params.largest_move
+            and abs(kf.states.x[r]) * WARMS > LARGEST_RATE_RATIO * params.largest_move
         ):
             return True
     return False

@@ -68,7 +68,7 @@ of its delay in s (a clock that was set, by 40 ms for instance)."""
 # share of the samples that a channel must deliver before its mean counts
 LEAST_PRESENCE = 0.9
 # log odds that each free amplitude costs: its size may lie anywhere in four decades
-SPREAD = 1.3
+AMPLITUDE_COST = 1.3
 # possible error of the model (axes, scale factors) as a share of the largest error
 MISFIT = 0.004
 FIT, FIT_PER_CHECK = 6.0, 2.5
@@ -138,7 +138,8 @@ class Inference:
     fitted: Flag  # 1: the likeliest hypothesis leaves only noise
     error: Channels  # error of each channel if no other is faulty, rad/s
     largest: Real  # largest error within the likeliest hypothesis, rad/s
-    spread: Square  # mean product of the errors over all hypotheses, by their odds, (rad/s)^2
+    # mean products of the errors over all hypotheses, by their odds, (rad/s)^2
+    error_products: Square
 
 
 @compiled
@@ -213,7 +214,7 @@ def noise_of_mean(params: Constants, noise: Noise, i: int, size: int) -> float:
         colour = max(1.0, noise.now.level[BLOCK, i] * slow)
         variance *= noise.unknown[i] * colour
     else:
-        burst = variance * max(1.0, BURST * noise.quick[i])
+        burst = variance * max(1.0, BURST * noise.recent_ratio[i])
         variance = max(burst, noise.now.block[i] * slow * size / params.length)
     return variance / size
 
@@ -253,7 +254,7 @@ def add_line(params: Constants, kf: Estimator, inference: Inference, size: int) 
             slow = 1.0
             if size >= params.length:
                 slow = math.sqrt(longest[i] * longest[j])
-            inference.covariance[i, j] += kf.shared.line[i, j] * slow / size
+            inference.covariance[i, j] += kf.shared.line_covariance[i, j] * slow / size
 
 
 @compiled
@@ -353,12 +354,12 @@ def add_channels(inference: Inference, n: int) -> None:
             set_direction(inference, n, 0, i)
             odds = log_ratio(inference, n, 1, 0.0)
             inference.error[i] = inference.amplitude[0]
-            add(inference, n, 1, odds - SPREAD, 1 << i, False)
+            add(inference, n, 1, odds - AMPLITUDE_COST, 1 << i, False)
     if free < 2:
         return
     prior = (
         math.log((COINCIDENCE if free > 2 else TWO_CHECKS * COINCIDENCE) / n)
-        - 2.0 * SPREAD
+        - 2.0 * AMPLITUDE_COST
     )
     for i in range(n):
         for j in range(i):
@@ -401,7 +402,7 @@ def add_units(params: Constants, inference: Inference) -> None:
             inference,
             n,
             count,
-            prior - count * SPREAD + log_ratio(inference, n, count, 0.0),
+            prior - count * AMPLITUDE_COST + log_ratio(inference, n, count, 0.0),
             inside,
             False,
         )
@@ -466,13 +467,13 @@ def update_spread(inference: Inference, n: int, total: float) -> None:
     """
     for i in range(n):
         for j in range(n):
-            inference.spread[i, j] = 0.0
+            inference.error_products[i, j] = 0.0
     for k in range(inference.count):
         share = inference.odds[k] / total
         if share > 1e-4:
             for i in range(n):
                 for j in range(n):
-                    inference.spread[i, j] += (
+                    inference.error_products[i, j] += (
                         share * inference.errors[k, i] * inference.errors[k, j]
                     )
 

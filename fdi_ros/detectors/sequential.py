@@ -201,12 +201,12 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     suspicious = mean_of(params, state.estimator, state.scales) > math.sqrt(
         params.limit
     )
-    kf.held = kf.held + kf.span if suspicious else 0.0
+    kf.held_seconds = kf.held_seconds + kf.span if suspicious else 0.0
     if learns and not suspicious:
         # These channels belonged to a case that was refused.
         kf.under_test = 0
         update_line(params, kf)
-    holds = kf.held > 0.0 and kf.held <= LONG_TIME and not case.open
+    holds = kf.held_seconds > 0.0 and kf.held_seconds <= LONG_TIME and not case.open
     # Without redundancy, errors show only at rest.
     if not holds and (kf.judged or kf.rest):
         learn(params, kf, weight)
@@ -306,12 +306,12 @@ def fill_verdict(
     n = params.sensors.n
     unsure = case.open and case.isolated == 0
     # The channels may disagree beyond the model, as in a shock at unequal sampling instants.
-    odd = 1.0 if case.open else kf.odd
+    chi_ratio = 1.0 if case.open else kf.chi_ratio
     fill_scores(params, state.estimator, state.scales, verdict.scores)
     for i in range(n):
-        variance = kf.shared.level[i] * odd
+        variance = kf.shared.level[i] * chi_ratio
         # What other channels share with this one is no noise of its own.
-        own = kf.noise.now.sample[i] * kf.noise.quick[i]
+        own = kf.noise.now.sample[i] * kf.noise.recent_ratio[i]
         verdict.noise[i] = math.sqrt(own / params.expected[i])
         sample.estimate.corrected[i] = kf.corrected[i]
         sample.estimate.variance[i] = variance
@@ -321,7 +321,7 @@ def fill_verdict(
         for j in range(n):
             # Until the faulty channels are named, each one may have the error that the
             # hypotheses give it.
-            doubt = case.inference.spread[i, j] if unsure else 0.0
+            doubt = case.inference.error_products[i, j] if unsure else 0.0
             sample.estimate.covariance[i, j] = kf.at.covariance[i, j] + doubt
         if unsure and kf.mask >> i & 1:
             # Where no hypothesis explains a deviation, the deviation itself counts.
@@ -332,7 +332,7 @@ def fill_verdict(
                 sample.estimate.covariance[i, i] += innovation * innovation
     sample.estimate.excess = kf.excess
     sample.estimate.behind = kf.behind
-    sample.estimate.spread = kf.spread
+    sample.estimate.largest_delay = kf.largest_delay
     sample.estimate.checked = 0 if is_blind(kf) else kf.checked
     for u in range(params.units):
         sample.estimate.late[u] = kf.late[u]
@@ -364,7 +364,7 @@ def judge(
     if not params.determines[kf.mask]:
         verdict.statistic = verdict.threshold = math.nan
         return
-    if sample.held:
+    if sample.in_recovery:
         if kf.excluded_from_rate:
             kf.mask = 0
         forget_evidence(params, state)
@@ -386,7 +386,7 @@ def judge(
         has_spike = kf.spiked != 0 and kf.spiked != kf.mask
         gain = kf.clean.gain if has_spike else kf.fused.gain
         correct_sample(params, kf, sample.z, gain)
-    sample.estimate.known = True
+    sample.estimate.is_current = True
     if kf.judged:
         follow_evidence(params, state, verdict)
     fill_verdict(params, state, sample, verdict)

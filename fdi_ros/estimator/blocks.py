@@ -196,10 +196,10 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
         kf.least_variance[r] = 0.0
     if kf.rest:
         return
-    quick = 0.0
+    largest_vibration = 0.0
     for a in range(3):
         inside = kf.shared.vibration[a]
-        quick = max(quick, inside)
+        largest_vibration = max(largest_vibration, inside)
         for i in range(n):
             along = (
                 params.sensors.axes[i, a]
@@ -209,7 +209,9 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
             inside = max(
                 inside, along * noise.now.block[i] * noise.longest[i] * noise.unknown[i]
             )
-            quick = max(quick, along * noise.now.block[i] * noise.longest[i])
+            largest_vibration = max(
+                largest_vibration, along * noise.now.block[i] * noise.longest[i]
+            )
         # A vibration peak is not motion.
         kf.usual_rate[a] += (
             kf.signal_rate[a] * kf.signal_rate[a] - kf.usual_rate[a]
@@ -240,7 +242,7 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
             / params.length
         )
         turn = kf.angular_acceleration[i] * kf.angular_acceleration[i]
-        least = unlearnable(error, 0.5 * quick / (kf.span * kf.span), turn)
+        least = unlearnable(error, 0.5 * largest_vibration / (kf.span * kf.span), turn)
         keep_least_variance(layout, i, TURN, least, kf.least_variance)
 
 
@@ -265,8 +267,12 @@ def learn(params: Constants, kf: Estimator, weight: float) -> None:
             layout, kf.states, kf.block_at.signals, kf.means[1], kf.block_innovation
         )
     if kf.rest or kept != kf.masks[1]:
-        known = 1.0 / (params.rest_std * params.rest_std) if kf.rest else UNKNOWN_RATE
-        fill_joint_parity(kf.block_parity, params.sensors, kept, kf.matrix, known)
+        prior_information = (
+            1.0 / (params.rest_std * params.rest_std) if kf.rest else UNKNOWN_RATE
+        )
+        fill_joint_parity(
+            kf.block_parity, params.sensors, kept, kf.matrix, prior_information
+        )
     update_least_variances(params, kf)
     update(
         layout,
@@ -292,19 +298,17 @@ def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
     moves = kf.noise.regime == MOTION
     begins = kf.turning or (moves and square > 4.0 * TURNING * kf.turn_noise)
     for i in range(n):
-        quick = speed = 0.0
+        turn = speed = 0.0
         for a in range(3):
             h = params.sensors.axes[i, a]
-            quick += h * (kf.rates[0, a] - kf.rates[1, a]) / ahead
+            turn += h * (kf.rates[0, a] - kf.rates[1, a]) / ahead
             speed += h * kf.rates[0, a]
         if not begins:
-            quick = 0.0
-        if abs(kf.angular_acceleration[i]) > abs(quick):
-            quick = kf.angular_acceleration[i]
+            turn = 0.0
+        if abs(kf.angular_acceleration[i]) > abs(turn):
+            turn = kf.angular_acceleration[i]
         kf.peak_turn[i] = (
-            quick
-            if abs(quick) > PEAK * abs(kf.peak_turn[i])
-            else PEAK * kf.peak_turn[i]
+            turn if abs(turn) > PEAK * abs(kf.peak_turn[i]) else PEAK * kf.peak_turn[i]
         )
         kf.peak_extra[i] = max(PEAK * kf.peak_extra[i], kf.extra[i])
         nonlinear_error = params.nonlinearity[i] * speed if moves else 0.0
@@ -341,7 +345,7 @@ def update_excess(params: Constants, kf: Estimator) -> None:
         variance = 0.0
         for j in range(n):
             for k in range(n):
-                together = kf.at.covariance[j, k] + kf.shared.line[j, k]
+                together = kf.at.covariance[j, k] + kf.shared.line_covariance[j, k]
                 if j == k:
                     together += kf.noise.now.sample[j]
                 variance += information[i, j] * together * information[i, k]

@@ -17,10 +17,10 @@ LONGEST_DELAY = 0.06
 
 @compiled
 def update_time_offsets(params: Constants, kf: Estimator) -> None:
-    """Update ``kf.behind`` and ``kf.spread``.
+    """Update ``kf.behind`` and ``kf.largest_delay``.
 
     ``behind`` is the time from the measurement of the corrected values to their stamp,
-    if the earliest unit is not late. ``spread`` is the largest delay between two units.
+    if the earliest unit is not late. ``largest_delay`` is that between two units.
 
     `restamp` brings all units to the instant of the latest unit. The delay states then
     refer to the first unit.
@@ -34,7 +34,7 @@ def update_time_offsets(params: Constants, kf: Estimator) -> None:
         most = max(most, remaining)
         least = min(least, remaining)
     kf.behind = latest - earliest
-    kf.spread = most - least
+    kf.largest_delay = most - least
 
 
 @compiled

@@ -18,7 +18,7 @@ from fdi_ros.core.records import Matrix, SampleInput
 from fdi_ros.estimator.estimator import Constants, Estimator, Total, update_weights
 from fdi_ros.model.samples import Array
 
-# variance by unknown positions over the noise's, from which it counts at once
+# variance by unknown positions over that of the noise, from which it counts at once
 DISPLACED = 0.1
 EDGES = 3.0
 """Blocks of motion by which a mean of the gyros and one of the accelerometers may differ at

@@ -166,8 +166,8 @@ class Estimator:
     # by how much corrected values lie before the stamp, if the earliest unit is in
     # time, s
     behind: Real
-    spread: Real  # largest delay between units, s
-    odd: Real  # chi-square of the last sample over the largest usual, at least 1
+    largest_delay: Real  # largest delay between units, s
+    chi_ratio: Real  # chi-square of the last sample over the largest usual, at least 1
     outliers: Mask  # channels of the last sample that are too far off to be used in it
     spiked: Mask  # of these, those of a spike; all, if the culprit is not known
     spikes: Counts  # of each channel so far
@@ -184,8 +184,9 @@ class Estimator:
     share: Channels  # of noise in the variance of each statistic; the rest is state uncertainty
     inflation: Channels  # its inverse, in this motion
     # information of each channel if all errors of the sensors were known, s^2/rad^2
-    known: Channels
-    growth: Channels  # variance of each channel by noise and states, (rad/s)^2
+    ideal_information: Channels
+    # variance of each channel by noise and states, (rad/s)^2
+    channel_variance: Channels
     judged: Mask  # channels that the others check
     checked: Mask  # judged channels whose state uncertainty hides no fault
     excess: Real  # largest variance of a residual over the one expected, at least 1
@@ -264,7 +265,7 @@ class Estimator:
     hole_at: Real
     hole_sample: Whole  # number of the last sample before the hole; 0: no hole
     used_at: Real  # of the last sample that was used, s since the start
-    held: Real  # s that the states have been held
+    held_seconds: Real  # s that the states have been held
     delays_checked_at: Real  # when delays were last looked at, s
     snapshot_at: Real  # when the last snapshot was kept, s
     # Totals since the start:
@@ -288,10 +289,12 @@ def update_weights(params: Constants, kf: Estimator) -> None:
     lasting = 2.0 * params.length
     for i in range(n):
         # Nonlinearity bounds what any channel can show in a turn, and is not ignorance.
-        kf.growth[i] = noise.now.sample[i] + lasting * kf.nonlinear_variance[i]
-    fill_parity(kf.parity, params.sensors, kf.mask, kf.growth)
+        kf.channel_variance[i] = (
+            noise.now.sample[i] + lasting * kf.nonlinear_variance[i]
+        )
+    fill_parity(kf.parity, params.sensors, kf.mask, kf.channel_variance)
     for i in range(n):
-        kf.known[i] = kf.parity.information[i, i]
+        kf.ideal_information[i] = kf.parity.information[i, i]
     for i in range(n):
         for j in range(n):
             kf.matrix[i, j] = lasting * kf.at.covariance[i, j]
@@ -306,14 +309,14 @@ def update_weights(params: Constants, kf: Estimator) -> None:
             kf.share[i] = max(share / information, LEAST_SHARE)
             # Scale the state uncertainty to 100 Hz, so that the check does not depend
             # on the sample rate.
-            hidden = kf.known[i] / information - 1.0
+            hidden = kf.ideal_information[i] / information - 1.0
             if hidden * (2.0 * BLOCK_TIME * 100.0) / lasting < 1.0 / CHECKABLE - 1.0:
                 kf.checked |= 1 << i
-        kf.growth[i] = kf.shared.level[i] + kf.at.covariance[i, i]
+        kf.channel_variance[i] = kf.shared.level[i] + kf.at.covariance[i, i]
     kept = kf.mask & ~kf.excluded_from_rate & ~kf.beyond
     if not params.spans[kept]:
         kept = kf.mask
-    fill_parity(kf.fused, params.sensors, kept, kf.growth)
+    fill_parity(kf.fused, params.sensors, kept, kf.channel_variance)
 
 
 @compiled
@@ -383,7 +386,7 @@ def excess_over_usual(chi: float, free: float) -> float:
 
 
 @compiled
-def motion_growth(kf: Estimator, rate: Vector) -> float:
+def motion_ratio(kf: Estimator, rate: Vector) -> float:
     """Growth of the state uncertainty since the last block, at a rate (3,), rad/s."""
     return max((square(rate) + SLOW_TURN) / (kf.speed_squared + SLOW_TURN), 1.0)
 
@@ -392,7 +395,7 @@ def motion_growth(kf: Estimator, rate: Vector) -> float:
 def update_statistics(params: Constants, kf: Estimator) -> None:
     """Normalise the innovations of a sample. The state uncertainty grows with the motion."""
     n = params.sensors.n
-    more = motion_growth(kf, kf.rate)
+    more = motion_ratio(kf, kf.rate)
     chi = 0.0
     free = -3.0
     for i in range(n):
@@ -410,7 +413,7 @@ def update_statistics(params: Constants, kf: Estimator) -> None:
             )
             free += 1.0
         kf.distance[i] = abs(kf.statistic[i]) * math.sqrt(kf.share[i] * kf.inflation[i])
-    kf.odd = excess_over_usual(chi, free)
+    kf.chi_ratio = excess_over_usual(chi, free)
 
 
 @compiled

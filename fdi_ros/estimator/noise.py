@@ -112,7 +112,7 @@ class Noise:
     # (rad/s)^2, square of the fastest rate since which the noise in motion is known
     largest_speed_squared: Real
     seen: Four  # values of each time scale so far
-    quick: Channels  # variance over the last half second, over the learned one
+    recent_ratio: Channels  # variance over the last half second, over the learned one
     unknown: Channels  # by how much the variance of long times may still be larger
     loudest: Channels  # largest variance of a sample so far, (rad/s)^2
     since: Channels  # time since it became much larger than any before, s
@@ -155,7 +155,8 @@ class SharedNoise:
     local: Channels  # mean of the innovations over half a second, rad/s
     outer: Square  # R, (rad/s)^2
     count: Real  # samples in `outer`
-    line: Square  # of R what lines explained while nothing was suspicious, (rad/s)^2
+    # part of R that lines explained while nothing was suspicious, (rad/s)^2
+    line_covariance: Square
     product: Square  # A R
     excess: Real  # level of R over independent channels, at least 1
     # share of the noise that lines explain, and independent channels do not
@@ -190,7 +191,7 @@ def begin_noise(noise: Noise, n: int, expected: Array) -> None:
             levels.sample[i] = levels.block[i] = expected[i]
             for k in range(SCALES + LAGS):
                 levels.level[k, i] = 1.0
-        noise.quick[i] = noise.square[i] = noise.share[i] = 1.0
+        noise.recent_ratio[i] = noise.square[i] = noise.share[i] = 1.0
         noise.squares[0, i] = noise.squares[1, i] = 1.0
         noise.unknown[i] = 1.0 + UNKNOWN
         noise.loudest[i] = expected[i]
@@ -247,7 +248,7 @@ def place_of(noise: Noise, mask: int) -> int:
 
 @compiled
 def update_sample_noise(
-    noise: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, odd: int
+    noise: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, slot: int
 ) -> None:
     """Take the statistics t (n,) of a sample; inflation: total variance over the noise alone."""
     gain = 1.0 / min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
@@ -268,13 +269,13 @@ def update_sample_noise(
             noise.largest[i] = max(energy, noise.largest[i])
             noise.steps[i] += min(square * inflation[i], THREE_SIGMA)
             noise.counted[i] += 1.0
-            step = square / max(1.0, BURST * noise.quick[i])
+            step = square / max(1.0, BURST * noise.recent_ratio[i])
             if learn:
                 noise.neighbours[i] += gain * (
-                    min(step * noise.squares[odd, i], FAR) - noise.neighbours[i]
+                    min(step * noise.squares[slot, i], FAR) - noise.neighbours[i]
                 )
                 noise.square[i] += gain * (step - noise.square[i])
-            noise.squares[odd, i] = step
+            noise.squares[slot, i] = step
     count_wild(noise, SAMPLE, n, mask, t)
 
 
@@ -316,14 +317,16 @@ def update_sample_variance(
         if mask >> i & 1:
             part = noise.counted[i] / length
             step = noise.steps[i] / length - part
-            noise.quick[i] += adaptation_gain * (step + part * (1.0 - noise.quick[i]))
+            noise.recent_ratio[i] += adaptation_gain * (
+                step + part * (1.0 - noise.recent_ratio[i])
+            )
             if part > 0.0:
                 # The states change once in a block, and values with them.
                 steps = max(noise.counted[i] - 1.0, 1.0)
                 noise.energies[blocks % RECENT, i] = noise.energy[i] / steps
             lasting = SELECTED * lasting_energy(noise, i)
             if lasting > FAR:
-                noise.quick[i] = max(noise.quick[i], lasting)
+                noise.recent_ratio[i] = max(noise.recent_ratio[i], lasting)
             if learn:
                 factor = 1.0 + gain * (step + part * noise.cross[i])
                 noise.now.sample[i] = max(
@@ -461,7 +464,7 @@ def follow_loudness(noise: Noise, n: int, louder: float, seconds: float) -> None
     """Begin to learn the slow noise of a channel anew where it is ``louder`` times as loud as ever before."""
     for i in range(n):
         noise.since[i] += seconds
-        variance = noise.now.sample[i] * max(1.0, BURST * noise.quick[i])
+        variance = noise.now.sample[i] * max(1.0, BURST * noise.recent_ratio[i])
         if variance > louder * noise.loudest[i]:
             noise.loudest[i] = variance
             noise.since[i] = 0.0

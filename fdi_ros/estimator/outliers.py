@@ -21,14 +21,15 @@ from fdi_ros.estimator.estimator import (
     Estimator,
     correct_sample,
     excess_over_usual,
-    motion_growth,
+    motion_ratio,
     usual_chi,
 )
 from fdi_ros.estimator.noise import BURST, FAR, THREE_SIGMA
 from fdi_ros.model.samples import Array
 
 OUTLIER = 5.5  # standard deviations, reached by normal noise in one of 2e7 values
-ALIKE = 0.95  # share of the largest distance from which a channel is also a candidate
+# share of the largest distance from which a channel is also a candidate
+CANDIDATE_SHARE = 0.95
 # longest spike: re-stamping spreads a single value over its neighbours
 SPIKE_SAMPLES = 4
 MISFIT = 1e-4
@@ -54,12 +55,12 @@ def find_outliers(params: Constants, kf: Estimator, values: Array) -> None:
     candidates = 0
     for i in range(params.sensors.n):
         # The distance of the culprit is the largest (Cauchy and Schwarz).
-        if kf.distance[i] > ALIKE * farthest:
+        if kf.distance[i] > CANDIDATE_SHARE * farthest:
             candidates |= 1 << i
     if kf.far_samples >= SPIKE_SAMPLES:
         # A lasting deviation is no spike: the evidence decides which channels are wrong.
-        growth = motion_growth(kf, kf.rate)
-        if largest_of(params, kf, growth) > OUTLIER:
+        ratio = motion_ratio(kf, kf.rate)
+        if largest_of(params, kf, ratio) > OUTLIER:
             kf.outliers = candidates
             kf.far_samples += 1
         else:
@@ -81,7 +82,7 @@ def explain_outliers(
     if params.determines[kf.mask & ~chosen]:
         chi_without(params, kf, chosen)
     # A rate that contains the spike would excuse the spike as a scale error.
-    largest = largest_of(params, kf, motion_growth(kf, kf.clean_rate))
+    largest = largest_of(params, kf, motion_ratio(kf, kf.clean_rate))
     if largest > OUTLIER:
         kf.outliers = chosen
     if largest * largest > FAR:
@@ -95,18 +96,18 @@ def explain_outliers(
 def excess_of(kf: Estimator, i: int) -> float:
     """Return the present noise variance of a channel over the learned one."""
     level = kf.shared.level[i] / kf.noise.now.sample[i]
-    return max(1.0, BURST * kf.noise.quick[i], level)
+    return max(1.0, BURST * kf.noise.recent_ratio[i], level)
 
 
 @compiled
-def largest_of(params: Constants, kf: Estimator, growth: float) -> float:
+def largest_of(params: Constants, kf: Estimator, ratio: float) -> float:
     """Return the largest distance of a channel, standard deviations.
 
-    ``growth`` is the present variance of the state uncertainty over the one in the sample.
+    ``ratio``: present variance of the state uncertainty over the one in the sample.
     """
     largest = 0.0
     for i in range(params.sensors.n):
-        variance = kf.share[i] + growth * (1.0 - kf.share[i])
+        variance = kf.share[i] + ratio * (1.0 - kf.share[i])
         size = kf.distance[i] / math.sqrt(excess_of(kf, i) * variance)
         largest = max(largest, size)
     return largest
@@ -245,14 +246,14 @@ def leave_spike_out(
     free = -3.0
     for i in range(params.sensors.n):
         free += (kf.mask & ~kf.spiked) >> i & 1
-    kf.odd = excess_over_usual(chi / burst, free)
+    kf.chi_ratio = excess_over_usual(chi / burst, free)
     correct_sample(params, kf, values, kf.clean.gain)
     for i in range(params.sensors.n):
         kf.imputed[i] = kf.corrected[i]
         if kf.spiked >> i & 1:
             kf.imputed[i] -= kf.innovation[i]
             # Some channels of an excluded unit may be correct.
-            if kf.innovation[i] ** 2 > OUTLIER * OUTLIER * kf.growth[i]:
+            if kf.innovation[i] ** 2 > OUTLIER * OUTLIER * kf.channel_variance[i]:
                 kf.spike_channels |= 1 << i
             kf.innovation[i] = 0.0
 

@@ -44,7 +44,7 @@ from fdi_ros.model.samples import Array
 
 MEMORY = 2.0  # averaging time of all quantities of this module, in half seconds
 # Excess of the inverse of the dimensions if all noise is one line: 1/2 - 1/3.
-LINE = 1.0 / 6.0
+LINE_EXCESS = 1.0 / 6.0
 INCOHERENT = 0.25  # squared correlation that independent noise may have in one second
 COHERENT = 1.0 - INCOHERENT  # squared correlation from which all noise counts as a line
 STEADY = 4.0
@@ -197,7 +197,7 @@ def update_shared_level(params: Constants, kf: Estimator) -> None:
         shared.checked_blocks[noise.regime] = min(before + 1.0, MOST_CHECKED)
     for i in range(n):
         own = noise.now.sample[i]
-        level = own * max(1.0, BURST * noise.quick[i], shared.excess)
+        level = own * max(1.0, BURST * noise.recent_ratio[i], shared.excess)
         seen = variance_along(params.sensors.axes[i], shared.vibration, 3)
         if checks > 0.0:
             level = max(level, own + UNEQUAL * UNEQUAL * seen)
@@ -237,7 +237,9 @@ def update_line(params: Constants, kf: Estimator) -> None:
     for i in range(params.sensors.n):
         for j in range(params.sensors.n):
             now = shared.coherent * shared.outer[max(i, j), min(i, j)]
-            shared.line[i, j] += adaptation_gain * (now - shared.line[i, j])
+            shared.line_covariance[i, j] += adaptation_gain * (
+                now - shared.line_covariance[i, j]
+            )
 
 
 @compiled
@@ -261,7 +263,7 @@ def update_dimensions(params: Constants, kf: Estimator, k: float) -> float:
     shared.excess = max(first / k, 1.0)
     chance = (k + 1.0) * params.length / (k * INDEPENDENT * shared.count)
     excess = second / max(first * first, 1e-30) - 1.0 / k - chance
-    return min(max(excess / LINE, 0.0), 1.0)
+    return min(max(excess / LINE_EXCESS, 0.0), 1.0)
 
 
 @compiled

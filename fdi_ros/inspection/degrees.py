@@ -15,11 +15,10 @@ import numpy as np
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.inspection.segments import LARGEST_BIAS, LENGTH
 from fdi_ros.inspection.topics import (
-    FASTEST,
     TopicReport,
 )
 from fdi_ros.inspection.turns import LEAST_ROTATION, SHARED
-from fdi_ros.model.samples import Array
+from fdi_ros.model.samples import LARGEST_GYRO_RANGE, Array
 from fdi_ros.report.layout import DEGREES
 from fdi_ros.system.text import figures, shown
 
@@ -45,7 +44,9 @@ LEAST_REST = 4.0
 NOISIEST = 0.02
 
 
-def in_degrees(chosen: Sequence[TopicReport], largest_rate: float = FASTEST) -> str:
+def in_degrees(
+    chosen: Sequence[TopicReport], largest_rate: float = LARGEST_GYRO_RANGE
+) -> str:
     """Return why topics of one body are in deg/s, empty if nothing shows that.
 
     ``largest_rate``: range of the gyros, rad/s.
@@ -103,7 +104,7 @@ class _Rest(NamedTuple):
 def _rest_of(report: TopicReport) -> _Rest:
     """Find the noise and the bias of a unit at rest."""
     segments = report.segments.all_segments()
-    noise = report.segments.noise(largest_bias=FASTEST)
+    noise = report.segments.noise(largest_bias=LARGEST_GYRO_RANGE)
     still = [
         one.means.mean(axis=0)
         for one, lies in zip(segments, noise.rest, strict=True)

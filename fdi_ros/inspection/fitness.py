@@ -20,7 +20,6 @@ from fdi_ros.inspection.degrees import in_degrees
 from fdi_ros.inspection.findings import Finding, Role
 from fdi_ros.inspection.topics import (
     BELIEVED,
-    FASTEST,
     TopicReport,
     burst_words,
     inspect,
@@ -28,6 +27,7 @@ from fdi_ros.inspection.topics import (
 )
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.noise import noisier_words
+from fdi_ros.model.samples import LARGEST_GYRO_RANGE
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
 from fdi_ros.report.layout import RADIANS, Unit
@@ -168,7 +168,7 @@ def refuse_unfit(bag: Path, config: Config) -> list[TopicReport]:
     `BagError` if a topic is in deg/s, stamps are of several clocks, or reading fails.
     """
     chosen = [one for one in inspect(bag, config.topics)[0] if one.channels]
-    if words := in_degrees(chosen, max(FASTEST, *config.health.max_rate)):
+    if words := in_degrees(chosen, max(LARGEST_GYRO_RANGE, *config.health.max_rate)):
         raise BagError(f"{bag} needs {words}; mend the driver")
     if words := one_clock(chosen, config.imus.timeout):
         raise BagError(f"{bag} needs one clock: {words}")

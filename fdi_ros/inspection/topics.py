@@ -36,8 +36,6 @@ from fdi_ros.system.text import date_of, figures, shown
 
 #: intervals longer than this many usual ones are gaps
 GAP = 3.0
-#: largest range of vehicle gyros is 2000 deg/s, 34.9 rad/s
-FASTEST = 36.0
 #: intervals by which the usual one is known
 SETTLED_STEPS = 100
 #: usual interval over the most frequent one: beyond, messages come in bursts

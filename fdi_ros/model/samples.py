@@ -20,6 +20,8 @@ Bytes = NDArray[np.uint8]
 # rad/s; a larger finite value counts as this: no gyro measures as much, no vehicle
 # survives it
 MAX_RATE = 1e3
+#: rad/s; ranges of vehicle gyros reach 2000 deg/s, 34.9 rad/s
+LARGEST_GYRO_RANGE = 36.0
 
 
 @dataclass(frozen=True)

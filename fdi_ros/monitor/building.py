@@ -251,7 +251,7 @@ def _fill_bias(bias: Any, config: Config, noise: NoiseModel) -> None:
     learning = config.bias.startup_bias_duration > 0
     bias["given"] = bool(fixed)
     bias["value"][:n] = bias["centre"][:n] = fixed or 0.0
-    bias["known"] = mask_of(range(n))
+    bias["channels_known"] = mask_of(range(n))
     bias["duration"] = _nanoseconds(config.bias.startup_bias_duration)
     bias["max_rate"] = config.bias.max_rest_rate
     prepare_limits(bias)

@@ -80,7 +80,7 @@ def _content(pipeline: Pipeline) -> dict[str, Any]:
         else None,
         "errors": _errors(pipeline.guard) if learned else None,
         "in_motion": bool(bias["outcome"] == IN_MOTION),  # biases as given
-        "known": [names[i] for i in members(int(bias["known"]))],
+        "known": [names[i] for i in members(int(bias["channels_known"]))],
         "declared": {
             "faulty": {
                 names[i]: WHY[decision["why"][i]]
@@ -277,7 +277,7 @@ def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
     if state["bias"] is not None:
         bias = core["bias"]
         bias["value"][:n] = list(state["bias"].values())
-        bias["known"] = mask_of(map(names.index, state["known"]))
+        bias["channels_known"] = mask_of(map(names.index, state["known"]))
         bias["learning"] = False
         bias["outcome"] = IN_MOTION if state["in_motion"] else RESTORED
         std = settings["turn_on"] if state["in_motion"] else settings["learned"][:n]

@@ -577,7 +577,9 @@ def _format_bias(bias: Any, names: Sequence[str], turn_on: float) -> str:
     outcome = int(bias["outcome"])
     if outcome in (LEARNED, RESTORED):
         missed = [
-            name for i, name in enumerate(names) if not is_in(i, int(bias["known"]))
+            name
+            for i, name in enumerate(names)
+            if not is_in(i, int(bias["channels_known"]))
         ]
         words = "learned" if outcome == LEARNED else "restored from the state file"
         return f"{words}, but not of {', '.join(missed)}" if missed else words

@@ -16,6 +16,7 @@ from fdi_ros import Geometry, NoiseModel
 from fdi_ros.compiling.compiled import allocate
 from fdi_ros.core.subsets import mask_of
 from fdi_ros.detectors.naming import (
+    AMPLITUDE_COST,
     COINCIDENCE,
     DELAY_STD,
     FIT,
@@ -25,7 +26,6 @@ from fdi_ros.detectors.naming import (
     SHIFTED_AMONG_FEW,
     SHIFTS,
     SMALLEST_SHIFT,
-    SPREAD,
     TWO_CHECKS,
     Inference,
     add_channels,
@@ -105,7 +105,7 @@ def oracle(mean):
     healthy, found = evidence(mean, np.zeros((n, n))), []
 
     def take(channels, prior, directions, std=0.0):
-        variance, spread = std**2, SPREAD * directions.shape[1]
+        variance, spread = std**2, AMPLITUDE_COST * directions.shape[1]
         if not std:
             error, scatter = amplitudes(mean, directions)
             # What can hardly be told apart has no figure worth comparing.

@@ -107,7 +107,7 @@ def level_and_limits(settings, rate):
     geometry = pipeline.geometry
     output = pipeline.process(block(np.tile(geometry.axes @ rate, (3, 1))))
     growth, limit = (
-        pipeline.core["now"]["growth"][0, : geometry.n],
+        pipeline.core["now"]["error_ratio"][0, : geometry.n],
         pipeline.subsets["limit"][-1, : geometry.n],
     )
     parts = geometry.S**2
