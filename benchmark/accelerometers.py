@@ -11,12 +11,16 @@ at the first unit, with the vibration of the body.
 nees: e' P^-1 e / 3 of the fused specific force from 15 s on, mean of the flights, worst flight beside; rms: of its
 error, m/s^2; level: share of samples whose error is beyond the protection level; ok: share of accelerometer-samples
 OK; sets: declarations of sets in all flights, by channels; faulty: healthy channels that were named; gyros included.
+
+logs: each accelerometer of the real flights with three units is off by so much, at three times a flight (--trials) and
+with signs in turn. named, held: share that is named, or in a set, within 10 s; faulty: others named.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -25,8 +29,10 @@ from trials import CONFIGS, NOISE, START, Array, Asked, Rng, Row, fresh
 from vibration import COUNTED, LENGTH, MOTORS, running_at
 
 from fdi_ros import Block, Config, Pipeline
+from fdi_ros.bag.samples import read_block
 from fdi_ros.experiments.flight import Motion, regular_stamps
 from fdi_ros.monitor.output import ChannelState
+from fdi_ros.replay.run import assumed_config
 
 GRAVITY, FORCE_NOISE, FORCE_BIAS = 9.81, 0.15, 0.3  # m/s^2
 SCALE, MISALIGNMENT = 0.01, float(np.radians(1.0))
@@ -40,7 +46,11 @@ FIGURES = {
     "ok": ".1%",
     "sets": "d",
     "faulty": "d",
+    "faults": "d",
+    "named": ".1%",
+    "held": ".1%",
 }
+SIZES, WITHIN = (5.0, 1.0, 0.3), 10.0  # m/s^2, s
 
 
 @dataclass
@@ -190,7 +200,7 @@ def config_of(
 
 
 def measure(asked: Asked) -> Iterator[Row]:
-    """Every condition with every mounting."""
+    """Every condition with every mounting; faults in real flights."""
     for mounting in MOUNTINGS:
         for name, (rate, change, *numbers) in CONDITIONS.items():
             label = f"{mounting}, {name}"
@@ -200,6 +210,63 @@ def measure(asked: Asked) -> Iterator[Row]:
                     for k in range(asked.count(3))
                 ]
                 yield label, figures_of(flown)
+    for size in SIZES:
+        label = f"logs, {size:g} m/s^2"
+        if asked.wants(label):
+            yield label, in_logs(size, asked)
+
+
+def in_logs(size: float, asked: Asked) -> dict[str, Any]:
+    """Count what becomes of errors of one size, m/s^2, in real flights."""
+    faults = named = held = faulty = 0
+    times = asked.count(3)
+    for path in sorted(asked.data.glob("logs/*.bin")):
+        config = assumed_config(path).config.replaced(asked.settings)
+        n = 3 * len(config.topics)
+        if n < 9:
+            continue
+        block = read_block(path, config)
+        for k, channel in product(range(times), range(n)):
+            start = round(len(block) * (0.3 + 0.5 * k / times))
+            end = start + round((WITHIN + 1.0) * config.sample_rate)
+            error = -size if (k + channel) % 2 else size
+            events = events_of_fault(
+                Pipeline(config), block[:end], start, channel, error
+            )
+            in_time = [
+                state for state, late in events.get(channel, ()) if late <= WITHIN
+            ]
+            faults += 1
+            named += ChannelState.FAULTY in in_time
+            held += bool(in_time)
+            faulty += any(
+                state == ChannelState.FAULTY
+                for other, own in events.items()
+                for state, _ in own
+                if other != channel
+            )
+    shares = {"named": named / max(faults, 1), "held": held / max(faults, 1)}
+    return {"faults": faults, "faulty": faulty, **shares}
+
+
+def events_of_fault(
+    pipeline: Pipeline, block: Block, start: int, channel: int, error: float
+) -> dict[int, list[tuple[ChannelState, float]]]:
+    """Return the declarations of each accelerometer, and s since an error in one begins."""
+    given = block.acceleration
+    assert given is not None
+    force = given.z.copy()
+    force[start:, channel] += error
+    output = pipeline.process(
+        replace(block, acceleration=Block(block.stamp, force, given.received))
+    )
+    n = pipeline.geometry.n
+    events: dict[int, list[tuple[ChannelState, float]]] = {}
+    for one in output.events:
+        late = (one.stamp - int(block.stamp[start])) * 1e-9
+        if one.declares and one.channel >= n and late >= 0.0:
+            events.setdefault(one.channel - n, []).append((one.after, late))
+    return events
 
 
 def figures_of(flown: list[dict[str, Any]]) -> dict[str, Any]:

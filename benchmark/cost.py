@@ -6,13 +6,15 @@
 One by one: one sample through `Pipeline.process`, and one of as many messages as there are units through the node's
 receiver; medians, us. Offline: many samples at once, us of CPU time a sample, median of five. calm: healthy channels in
 motion; faults: every ten seconds one channel is off for one second, and declarations are forgiven after half a second;
-noise: twice what the settings say. --trials: thousands of samples offline.
+noise: twice what the settings say. nine and nine: nine gyros and the nine accelerometers beside them. --trials:
+thousands of samples offline.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from statistics import median
 from typing import Any
 
@@ -21,7 +23,7 @@ from trials import NOISE, PARALLEL, Asked, Flight, Row, Sines
 
 from fdi_ros import Block, Config, Pipeline
 from fdi_ros.core.live import MORE, SUPPLY
-from fdi_ros.core.messages import ImuTemplate
+from fdi_ros.core.messages import ImuTemplate, fill_force
 from fdi_ros.monitor.receiver import Receiver
 
 FIGURES = {
@@ -34,6 +36,7 @@ FOUR = {
     "imus.topics": (*PARALLEL["imus.topics"], "imu_4/data_raw"),
     "imus.names": (*PARALLEL["imus.names"], "imu_4"),
 }
+GRAVITY, SWAY, FORCE_NOISE = 9.81, 2.0, 0.15  # m/s^2
 FORGIVING = {"decision.latch": False, "decision.clean_time": 0.5}
 SITUATIONS = ("calm", "faults", "noise")
 WARM, MEASURED, REPEATS = 3000, 3000, 5  # samples one by one, and runs offline
@@ -48,7 +51,30 @@ def stream(pipeline: Pipeline, asked: Asked, count: int, situation: str) -> Bloc
         second = flight.seconds.astype(int)
         struck = (second % 10 == 9) & (second > 10)
         added[struck, second[struck] // 10 % flight.shape[1]] += 0.1 / NOISE
-    return flight.block(added)
+    block = flight.block(added)
+    if pipeline.accelerometers is None:
+        return block
+    force = FORCE_NOISE * rng.standard_normal(block.z.shape)
+    force += SWAY * np.sin(1.7 * flight.seconds)[:, np.newaxis]
+    force[:, 2::3] += GRAVITY
+    return replace(block, acceleration=Block(block.stamp, force))
+
+
+def messages_of(block: Block, units: range) -> list[list[bytes]]:
+    """Return the messages of each sample."""
+    template = ImuTemplate("imu")
+    messages = []
+    for k, (stamp, row) in enumerate(zip(block.stamp, block.z, strict=True)):
+        of_sample = []
+        for unit in units:
+            own = slice(3 * unit, 3 * unit + 3)
+            template.fill(int(stamp), row[own].tolist(), (0.0,) * 9)
+            if block.acceleration is not None:
+                force = block.acceleration.z[k, own]
+                fill_force(template.bytes, template.at, 1.0, force, np.zeros(6))
+            of_sample.append(template.bytes.tobytes())
+        messages.append(of_sample)
+    return messages
 
 
 def each(call: Callable[[int], Any], count: int) -> float:
@@ -66,15 +92,9 @@ def one_by_one(config: Config, asked: Asked) -> dict[str, float]:
     pipeline = Pipeline.from_config(config)
     block = stream(pipeline, asked, WARM + MEASURED, "calm")
     pipeline.process(block[:WARM])
-    S, z, units = pipeline.geometry.S, block.z, range(pipeline.geometry.n // 3)
-    receiver, template = Receiver(Pipeline.from_config(config)), ImuTemplate("imu")
-    messages = [
-        [
-            template.fill(int(stamp), row[3 * unit : 3 * unit + 3].tolist(), (0.0,) * 9)
-            for unit in units
-        ]
-        for stamp, row in zip(block.stamp, z, strict=True)
-    ]
+    S, z = pipeline.geometry.S, block.z
+    receiver = Receiver(Pipeline.from_config(config))
+    messages = messages_of(block, range(pipeline.geometry.n // 3))
 
     def take(k: int) -> None:
         for unit, message in enumerate(messages[k]):
@@ -106,8 +126,13 @@ def offline(pipeline: Pipeline, block: Block) -> float:
 
 
 def measure(asked: Asked) -> Iterator[Row]:
-    """Six, nine and twelve channels, at 100 Hz and 1 kHz."""
-    configs = {**asked.configs(), "twelve": asked.configs(FOUR)["six"]}
+    """Six, nine and twelve channels, and nine with their accelerometers, at 100 Hz and 1 kHz."""
+    felt = {"accelerometers.enabled": "on", "accelerometers.noise_std": FORCE_NOISE}
+    configs = {
+        **asked.configs(),
+        "twelve": asked.configs(FOUR)["six"],
+        "nine and nine": asked.configs(felt)["nine"],
+    }
     for mounting, config in configs.items():
         if not asked.wants(mounting):
             continue

@@ -18,8 +18,9 @@ from fdi_ros.core.records import Matrix, SampleInput
 from fdi_ros.estimator.estimator import Constants, Estimator, Total, update_weights
 from fdi_ros.model.samples import Array
 
-# variance by unknown positions over that of the noise, from which it counts at once
-DISPLACED = 0.1
+# growth of the variance of a sample by unknown positions, from which it counts at once:
+# more than the peak fades from block to block
+DISPLACED = 0.3
 EDGES = 3.0
 """Blocks of motion by which a mean of the gyros and one of the accelerometers may differ at
 their ends: filters and sampling instants are not the same."""
@@ -29,6 +30,7 @@ their ends: filters and sampling instants are not the same."""
 def follow_displacement(params: Constants, kf: Estimator, sample: SampleInput) -> None:
     """Follow the variance by unknown positions, and the turn of the body; a turn that begins counts at once."""
     n = params.sensors.n
+    lasting = 2.0 * params.length
     begins = False
     kf.may_be_apart = False
     for i in range(n):
@@ -47,8 +49,9 @@ def follow_displacement(params: Constants, kf: Estimator, sample: SampleInput) -
             turned[a, b] += spin[a] * spin[b]
     for i in range(n):
         kf.displaced[i] = max(kf.displaced[i], sample.displaced[i])
-        lasting = 2.0 * params.length * (kf.displaced[i] - kf.allowed[i])
-        begins = begins or lasting > DISPLACED * kf.noise.now.sample[i]
+        known = kf.noise.now.sample[i] + lasting * kf.allowed[i]
+        grown = lasting * (kf.displaced[i] - kf.allowed[i])
+        begins = begins or grown > DISPLACED * known
     if not begins:
         return
     for i in range(n):

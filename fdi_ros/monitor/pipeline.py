@@ -98,6 +98,7 @@ class Pipeline:
         """Whether the first samples are to show which units have accelerometers."""
         self.felt: tuple[int, ...] = ()
         """Numbers of the units whose accelerometers are judged; of an array those of the accelerometers."""
+        self._places = np.zeros(0, dtype=np.int64)  # of these among all of a sample
         self._built: dict[tuple[int, ...], Pipeline] = {}
         self.core = build_core(config, self.geometry, self.noise)
         """All that the sample path is given and remembers, (1,) `fdi_ros.core.records.Core`."""
@@ -132,6 +133,7 @@ class Pipeline:
         chosen = tuple(units)
         self.undecided = False
         self.felt = chosen if len(chosen) > 1 else ()
+        self._places = np.array(places(self.config, self.felt), dtype=np.int64)
         self.accelerometers = self.build_accelerometers(chosen) if self.felt else None
         self.channel_names = tuple(
             name for half in self.halves for name in half.geometry.channel_names
@@ -151,14 +153,20 @@ class Pipeline:
         if self.accelerometers is None:
             return replace(block, acceleration=None)
         given = block.acceleration
-        columns = places(self.config, self.felt)
+        columns = self._places
         if given is None:
             nothing = np.full((len(block), len(columns)), np.nan)
-            given = Block(block.stamp, nothing, np.zeros(nothing.shape, dtype=bool))
-        elif self.config.has_units and given.z.shape[1] == 3 * len(self.config.topics):
-            received = None if given.received is None else given.received[:, columns]
-            given = Block(given.stamp, given.z[:, columns], received)
-        return replace(block, acceleration=given)
+            none = Block(block.stamp, nothing, np.zeros(nothing.shape, dtype=bool))
+            return replace(block, acceleration=none)
+        if (
+            len(columns) == given.z.shape[1]
+            or not self.config.has_units
+            or given.z.shape[1] != 3 * len(self.config.topics)
+        ):
+            return block
+        received = None if given.received is None else given.received[:, columns]
+        chosen = Block(given.stamp, given.z[:, columns], received)
+        return replace(block, acceleration=chosen)
 
     def __repr__(self) -> str:
         states = ", ".join(
@@ -482,11 +490,13 @@ class Pipeline:
         samples["received"][:, :n] = True if block.received is None else block.received
         if self.accelerometers is not None and block.acceleration is not None:
             force = block.acceleration
-            columns = places(self.config, self.felt)
+            columns = self._places
             if force.z.shape[1] != len(columns):
                 raise ConfigError(
                     f"accelerations have shape {force.z.shape}, expected (N, {len(columns)})"
                 )
             samples["force"][:, columns] = force.z
-            samples["felt"][:, columns] = force.delivered
+            samples["felt"][:, columns] = (
+                True if force.received is None else force.received
+            )
         return samples
