@@ -575,6 +575,6 @@ def test_a_set_narrows_down_to_the_channel_that_later_evidence_singles_out():
 def test_alarms_held_off_are_suspicion_and_never_a_declaration():
     decider, changes = Decider(2, 4), []
     for held in (True, True, True, True, False, False):
-        changes.append(decider.take((1,), isolated=True, held=held))
+        changes.append(decider.take((1,), isolated=True, no_votes=held))
         assert decider.channels("suspicion") == {1}
     assert changes == [False] * 5 + [True]
