@@ -51,7 +51,7 @@ COLUMNS = "columns.yaml"
 GUIDE = 'docs/flight_logs.md, "Tables of text"'
 KIND = "columns"
 #: bytes that are read at once
-_PORTION = 1 << 21
+_READ_BYTES = 1 << 21
 _TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _DEGREES = math.pi / 180.0
 _RATE_UNITS = {
@@ -74,7 +74,7 @@ _FORCE_UNITS = {
 _UNIT = re.compile(
     r"[\[(]([^\d\[(\])][^\[(\])]*)[\])]$|_(rad_s|radps|deg_s|dps|m_s2|mps2|m?g)$|(?<=[a-z])_?(ns|us|ms)$|_(s|sec)$"
 )
-_TIME = re.compile(
+_TIME_NAME = re.compile(
     r"\W*_*(?:field\.)?(?:header\.)?(?:t|time|time_?stamp|stamp|timestamp_sample|secs?|seconds)"
 )
 _AXIS = re.compile(r"(?:([xyz])|\[([012])\])[._ ]*(\d*)$")
@@ -143,7 +143,7 @@ class CsvLog(FlightLog):
         rest = b""
         while rest or offset < self.end:
             data = rest + self.file.read(
-                max(0, min(_PORTION, self.end - offset - len(rest)))
+                max(0, min(_READ_BYTES, self.end - offset - len(rest)))
             )
             final = offset + len(data) >= self.end
             size = data.rfind(b"\n") + 1
@@ -313,7 +313,7 @@ def _chosen_names(
         raise BagError(
             f"{path}: accelerations names {len(forces)} IMUs, imus names {len(imus)}"
         )
-    by_name = (name for name in names if _TIME.fullmatch(_split(name)[0]))
+    by_name = (name for name in names if _TIME_NAME.fullmatch(_split(name)[0]))
     time: Any = given.get("time", next(by_name, None))
     listed = shown(", ".join(names), MOST_SHOWN)
     for name in (time, *(column for triad in (*imus, *forces) for column in triad)):
@@ -402,7 +402,7 @@ def _triads(names: Sequence[str]) -> dict[tuple[str, str], dict[str, str]]:
     for name in names:
         plain = _split(name)[0]
         match = _AXIS.search(plain)
-        if match and not _TIME.fullmatch(plain):
+        if match and not _TIME_NAME.fullmatch(plain):
             axis = match[1] or "xyz"[int(match[2])]
             head = plain[: match.start()].rstrip("._ ")
             groups.setdefault((head, match[3]), {}).setdefault(axis, name)

@@ -54,12 +54,12 @@ from fdi_ros.model.samples import Array, Bytes, Int
 #: records of a log, by field
 Rows = NDArray[np.void]
 #: bytes that are read at once, much more than the longest record
-_PORTION = 1 << 22
+_PORTION_BYTES = 1 << 22
 _FMT = 128
 _FMT_SIZE = 89
 #: bytes of a record before its values
 _HEAD = 3
-_TYPES = (
+_FIELD_TYPES = (
     {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "c": "<i2", "C": "<u2"}
     | {
         "i": "<i4",
@@ -257,9 +257,9 @@ class DataflashLog(FlightLog):
         while True:
             self.file.seek(offset)
             data = np.frombuffer(
-                self.file.read(min(_PORTION, self.end - offset)), dtype=np.uint8
+                self.file.read(min(_PORTION_BYTES, self.end - offset)), dtype=np.uint8
             )
-            final = offset + _PORTION >= self.end
+            final = offset + _PORTION_BYTES >= self.end
             # Numbers of a damaged log may be anything.
             with np.errstate(all="ignore"):
                 samples, size, beside = self._read(data, offset, final)
@@ -448,7 +448,7 @@ def _layout(
     name: str, size: int, types: str, columns: Sequence[str]
 ) -> np.dtype[np.void]:
     """Return the layout of a message. `ValueError` names the missing part."""
-    if len(columns) != len(types) or set(types) - _TYPES.keys():
+    if len(columns) != len(types) or set(types) - _FIELD_TYPES.keys():
         raise ValueError("its FMT record is damaged")
     sensor = _SENSORS.fullmatch(name)
     rate, acceleration = _VALUES[sensor[1]] if sensor else ((), ())
@@ -462,8 +462,8 @@ def _layout(
         if column in (*needed, *acceleration, *_OPTIONAL) and kind in _TYPES_OF.get(
             column, _NUMBERS
         ):
-            fields.setdefault(column, (_TYPES[kind], at))
-        at += np.dtype(_TYPES[kind]).itemsize
+            fields.setdefault(column, (_FIELD_TYPES[kind], at))
+        at += np.dtype(_FIELD_TYPES[kind]).itemsize
     if at != size:
         raise ValueError(f"its records have {size} bytes, its columns {at}")
     if lacking := sorted(needed - fields.keys()):

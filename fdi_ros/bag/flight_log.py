@@ -57,13 +57,13 @@ _FEWEST_COARSE = 3
 #: largest step back of time within one log, us
 _MAX_STEP_BACK = 1_000_000
 #: samples whose median time marks the progress of a log, robust to damaged times
-_BESIDE = 17
+_NEIGHBOURS = 17
 #: lowest rate of logged means, Hz
 _COARSE_RATE = 0.5
 #: distance from neighbours at which a time is damaged, us
 _MAX_TIME_STEP = 10_000_000
 #: messages per batch, few enough that a chunk of a converted bag covers a short time
-_BATCH_MESSAGES = 1 << 10
+_LOG_BATCH = 1 << 10
 #: instances of one kind, more than any autopilot has, that are looked at for copies
 _MOST_COMPARED = 16
 #: messages that are named of a log without IMUs
@@ -161,12 +161,12 @@ class Track:
         A second log begins there.
         """
         samples = _joined([self.recent, samples])
-        self.recent = samples[1 - _BESIDE :]
+        self.recent = samples[1 - _NEIGHBOURS :]
         if not len(samples):
             return 0
         come = stamp = samples["stamp"]
         if (np.abs(np.diff(stamp)) > _MAX_STEP_BACK).any():
-            come = _medians(stamp, _BESIDE)
+            come = _medians(stamp, _NEIGHBOURS)
         first = int(come[0]) if self.come is None else self.come
         before = np.maximum.accumulate(np.append(first, come[:-1]))
         self.come = max(first, int(come.max()))
@@ -380,9 +380,9 @@ class FlightLog(BagFile):
             stamp = (samples["stamp"] + self._shift) * 1000
             order = np.argsort(stamp, kind="stable")
             horizon = self._log_time(later)
-            for k in range(0, len(order), _BATCH_MESSAGES):
-                rows = order[k : k + _BATCH_MESSAGES]
-                rest = order[k + _BATCH_MESSAGES :]
+            for k in range(0, len(order), _LOG_BATCH):
+                rows = order[k : k + _LOG_BATCH]
+                rest = order[k + _LOG_BATCH :]
                 data = _encoded(templates[place[rows]], stamp[rows], samples.take(rows))
                 count, size = data.shape
                 yield Batch(

@@ -34,7 +34,7 @@ from fdi_ros.system.files import (
     ROS1_INDEX_BYTES,
 )
 
-_WRONG = (
+_ROS1_ERRORS = (
     *(ReaderError, SerdeError, struct.error, AssertionError, LookupError, ValueError),
     *(EOFError, OSError, RuntimeError, MemoryError, RecursionError),
 )
@@ -82,7 +82,7 @@ class Ros1File(LibraryBag):
                 for one in self._reader.connections
             }
             self.start_time = self._reader.start_time
-        except _WRONG as error:
+        except _ROS1_ERRORS as error:
             self.file.close()
             if "not indexed" in str(error):
                 raise BagError(
@@ -106,7 +106,7 @@ class Ros1File(LibraryBag):
             connections = [one for one in self._reader.connections if one.id in numbers]
             for connection, time, data in self._reader.messages(connections):
                 yield connection.id, time, self._converted(data, connection.msgtype)
-        except _WRONG as error:
+        except _ROS1_ERRORS as error:
             self.note(f"it is damaged ({error}): read up to there")
 
     def _converted(self, data: bytes, kind: str) -> bytes:
@@ -115,7 +115,7 @@ class Ros1File(LibraryBag):
             return b""
         try:
             return bytes(self._store.ros1_to_cdr(data, kind))
-        except _WRONG:
+        except _ROS1_ERRORS:
             return b""
 
     def _unpacked(self, unpacker: Callable[[], Any] | None, data: bytes) -> bytes:

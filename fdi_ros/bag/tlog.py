@@ -48,7 +48,13 @@ from fdi_ros.system.files import (
 )
 
 _IMUS = tuple(message.name for message in MESSAGES.values())
-_BESIDE = ("HEARTBEAT", "PARAM_VALUE", "VFR_HUD", "STATUSTEXT", "AUTOPILOT_VERSION")
+_OTHER_MESSAGES = (
+    "HEARTBEAT",
+    "PARAM_VALUE",
+    "VFR_HUD",
+    "STATUSTEXT",
+    "AUTOPILOT_VERSION",
+)
 """Messages that are read beside the rates."""
 #: first bytes of messages of MAVLink 1 and 2
 _MARKS = (0xFE, 0xFD)
@@ -100,7 +106,7 @@ class Tlog(LibraryLog):
         self.system, autopilot = chosen
         found: defaultdict[Source, bytearray] = defaultdict(bytearray)
         beside: list[tuple[int, Any]] = []
-        for at, end, message in self._messages(data, (*_IMUS, *_BESIDE)):
+        for at, end, message in self._messages(data, (*_IMUS, *_OTHER_MESSAGES)):
             if message.get_srcSystem() != self.system:
                 continue
             came = int.from_bytes(data[at : at + _TIME], "big")

@@ -56,12 +56,12 @@ _SUBSCRIPTION, _DATA = b"AD"
 #: formats within formats
 _DEEPEST = 16
 _SELECTED, _STATUS = "sensor_combined", "vehicle_imu_status"
-_KINDS = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo", _SELECTED, _STATUS)
+_IMU_TOPICS = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo", _SELECTED, _STATUS)
 _RAW_GYRO, _RAW_FORCE = "sensor_gyro", "sensor_accel"
 """Messages of a gyro, and of an accelerometer, which may be samples of other times."""
-_GPS = ("sensor_gps", "vehicle_gps_position")
+_GPS_TOPICS = ("sensor_gps", "vehicle_gps_position")
 _LACKS = "its format lacks a field, or is not that of its samples"
-_WRONG = (
+_PYULOG_ERRORS = (
     ArithmeticError,
     AttributeError,
     LookupError,
@@ -154,9 +154,9 @@ class Ulog(LibraryLog):
         parts: defaultdict[Source, list[Columns]] = defaultdict(list)
         for one in log.data_list:
             self.counts[one.name] += message_count(one.data)
-            if one.name in _KINDS:
+            if one.name in _IMU_TOPICS:
                 parts[Source(one.name, one.multi_id)].append(one.data)
-            elif one.name in _GPS and self.start_utc is None:
+            elif one.name in _GPS_TOPICS and self.start_utc is None:
                 self.start_utc = _start_utc(one.data)
             self._take_flight(one.name, one.data)
         found = {
@@ -175,7 +175,7 @@ class Ulog(LibraryLog):
             if log.file_corruption
             else set()
         )
-        self.unread = dict.fromkeys(lacking | (announced & set(_KINDS)), _LACKS)
+        self.unread = dict.fromkeys(lacking | (announced & set(_IMU_TOPICS)), _LACKS)
         status = {one: found[one] for one in sorted(found) if one.kind == _STATUS}
         together = _simultaneous(status)
         self.status = _status_words(status, together)
@@ -332,7 +332,7 @@ def _parsed(file: _Bounded, path: str) -> Any:
         raise BagError(
             f"{path} is a ULog of a later version, whose flags say that it must not be read"
         ) from error
-    except (ULogException, *_WRONG) as error:
+    except (ULogException, *_PYULOG_ERRORS) as error:
         raise BagError(f"{path} cannot be read by pyulog: {error}") from error
 
 

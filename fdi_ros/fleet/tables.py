@@ -290,7 +290,7 @@ class Tables:
 # The page: flights that need attention come first
 
 
-MOST_ROWS = 2000
+MOST_TABLE_ROWS = 2000
 """Largest number of flights in a table of the page. flights.parquet has all."""
 LOOKS = 10
 """Largest number of flights with reasons that a terminal shows."""
@@ -452,10 +452,14 @@ def _section(
     title: str, hint: str, flights: Sequence[Row], without: str = ""
 ) -> Section:
     more = (
-        f" The first {MOST_ROWS} of {len(flights)}." if len(flights) > MOST_ROWS else ""
+        f" The first {MOST_TABLE_ROWS} of {len(flights)}."
+        if len(flights) > MOST_TABLE_ROWS
+        else ""
     )
     columns = (
-        column for column in columns_of(flights[:MOST_ROWS]) if column.name != without
+        column
+        for column in columns_of(flights[:MOST_TABLE_ROWS])
+        if column.name != without
     )
     table = html_table(*told(columns), sort=True)
     return Section(

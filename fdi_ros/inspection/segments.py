@@ -29,7 +29,7 @@ AS_QUIET, ROUNDS = (
     10,
 )
 #: ratio to the noise at rest that counts as vibration; bound of slow over fast noise
-LOUDER = 2.0
+VIBRATION_RATIO = 2.0
 #: rad/s, that a gyro at rest has
 LARGEST_BIAS = 0.1
 #: segments kept; longer recordings keep every second one, then every fourth
@@ -48,7 +48,7 @@ class NoiseSegment(NamedTuple):
     std: Array
     #: (c,) noise of a sample beyond any smooth motion, rad/s, 0 if values never change
     noise: Array
-    #: (c,) of the blocks, with slower noise that is no more than `LOUDER` times as
+    #: (c,) of the blocks, with slower noise that is no more than `VIBRATION_RATIO` times as
     #: large
     block_noise: Array
 
@@ -116,7 +116,7 @@ class NoiseSegments:
         least, block = _least_noise(segments)
         known = np.full(self.channels, largest_bias**2 / THREE_SIGMA)
         rest = [
-            bool((one.noise <= LOUDER * least).all())
+            bool((one.noise <= VIBRATION_RATIO * least).all())
             and rests(
                 np.ascontiguousarray(one.means),
                 REST_BLOCKS - 1,
@@ -184,7 +184,7 @@ def _segment(values: Array, first: int) -> NoiseSegment:
         means,
         std,
         _noise(values),
-        np.clip(means.std(axis=0), least, LOUDER * least),
+        np.clip(means.std(axis=0), least, VIBRATION_RATIO * least),
     )
 
 

@@ -34,7 +34,7 @@ from fdi_ros.inspection.fitness import (
     one_clock,
 )
 from fdi_ros.inspection.topics import (
-    GAP,
+    GAP_INTERVALS,
     TopicReport,
     burst_words,
     inspect,
@@ -217,7 +217,7 @@ def starting_config(
         known |= settings
     else:
         known |= _settings_of_array(chosen[0], urdf)
-    if silent := _longer(chosen, GAP, 60.0):
+    if silent := _longer(chosen, GAP_INTERVALS, 60.0):
         known["health.stale_timeout"] = silent, f"the default is {TIMEOUT:g} s"
     return StartingConfig(
         shown(bag.name),

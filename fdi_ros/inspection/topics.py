@@ -35,13 +35,13 @@ from fdi_ros.system.files import NAME
 from fdi_ros.system.text import date_of, figures, shown
 
 #: intervals longer than this many usual ones are gaps
-GAP = 3.0
+GAP_INTERVALS = 3.0
 #: intervals by which the usual one is known
 SETTLED_STEPS = 100
 #: usual interval over the most frequent one: beyond, messages come in bursts
 BURST = 2.0
 #: messages of a topic whose intervals are kept
-MOST_STEPS = 1_000_000
+MOST_INTERVALS = 1_000_000
 #: messages in a row in which copies are looked for
 RECENT = 256
 #: larger values are damage, rad/s; their squares must not overflow
@@ -265,10 +265,10 @@ def _take_times(report: TopicReport, times: Int) -> None:
     if not len(steps):
         return
     report.longest = max(report.longest, float(steps.max()))
-    if report.received - len(times) < MOST_STEPS:
+    if report.received - len(times) < MOST_INTERVALS:
         report.intervals.append(steps)
     if report.interval > 0:
-        report.gaps += int((steps > GAP * report.interval).sum())
+        report.gaps += int((steps > GAP_INTERVALS * report.interval).sum())
     elif report.received > SETTLED_STEPS:
         _settle(report)
 
@@ -280,7 +280,7 @@ def _settle(report: TopicReport) -> None:
     steps = np.concatenate(report.intervals)
     report.interval = usual_interval(steps)
     if report.interval > 0:
-        report.gaps = int((steps > GAP * report.interval).sum())
+        report.gaps = int((steps > GAP_INTERVALS * report.interval).sum())
 
 
 def _take_frames(report: TopicReport, batch: Batch, rows: Int) -> None:
@@ -303,7 +303,7 @@ def _take_stamps(report: TopicReport, stamp: Int) -> None:
     first, *before = (int(stamp[0]),) if report.stamps is None else report.stamps
     steps = np.diff(np.concatenate([before, stamp])) * 1e-9
     report.backward += int((np.diff(stamp) <= 0).sum())
-    if report.received <= MOST_STEPS:
+    if report.received <= MOST_INTERVALS:
         report.stamp_steps.append(steps)
     report.stamps = first, int(stamp[-1])
 

@@ -34,7 +34,7 @@ from fdi_ros.monitor.recent import RecentHealth
 from fdi_ros.replay.run import Sink
 from fdi_ros.system.files import LATEST
 
-_STATES = np.array([state.name for state in ChannelState])
+_STATE_NAMES = np.array([state.name for state in ChannelState])
 
 
 class CsvFile(Sink):
@@ -83,7 +83,7 @@ class CsvFile(Sink):
         )
         values = np.hstack([half.z for half in block.halves])
         channels = np.stack([values, output.residual], axis=2).tolist()
-        states = _STATES[output.state].tolist()
+        states = _STATE_NAMES[output.state].tolist()
         rows = zip(
             output.stamp.tolist(),
             numbers.tolist(),

@@ -66,7 +66,7 @@ LOG_FROM = 10.0
 """Ratio of statistic to threshold from which on the scale is logarithmic."""
 _AXES = "xyz"
 _INK = "var(--text)"
-MOST_ROWS = 1000
+MOST_PAGE_ROWS = 1000
 """Largest number of rows in the table of events."""
 MOST_CARDS = 200
 """Largest number of episodes on the page. The JSON file has all."""
@@ -600,15 +600,15 @@ def _event_section(events: Sequence[StateChange], unit: Unit) -> Section:
         ),
     }
     more = (
-        f" {len(events) - MOST_ROWS} more are left out."
-        if len(events) > MOST_ROWS
+        f" {len(events) - MOST_PAGE_ROWS} more are left out."
+        if len(events) > MOST_PAGE_ROWS
         else ""
     )
     hint = f"The history: what it came to stands above.{more}"
     return Section(
         "Changes of state",
         hint,
-        head_and_rows(columns, events[:MOST_ROWS]) if events else [],
+        head_and_rows(columns, events[:MOST_PAGE_ROWS]) if events else [],
     )
 
 
@@ -869,7 +869,9 @@ def _autopilot_section(said: Sequence[AutopilotText]) -> list[Section]:
     return (
         [
             Section(
-                "What the autopilot said", "", head_and_rows(columns, said[:MOST_ROWS])
+                "What the autopilot said",
+                "",
+                head_and_rows(columns, said[:MOST_PAGE_ROWS]),
             )
         ]
         if said

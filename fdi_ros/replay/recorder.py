@@ -62,11 +62,11 @@ _DECLARED, _EPISODE_STATES, _HIDING = (
 """States with a declaration, states of an episode, and states that hide a declaration."""
 
 MOST_EPISODES = 1000
-MOST_STEPS = 20
+MOST_EPISODE_STEPS = 20
 """Largest number of steps of an episode. The last step is always kept."""
 UNIT_SILENCE = 0.5
 """Channels of a unit that fall silent within this time, s, belong to one episode."""
-AFTER_HOLE = 0.5
+SILENCE_AFTER_HOLE = 0.5
 """Silence shorter than `HOLE` that begins within this time after a hole, s, belongs to the
 hole."""
 RATE_BEFORE = 0.5
@@ -330,7 +330,15 @@ class Recorder:
     ) -> None:
         """Open an episode."""
         self._open.append(
-            _Open(kind, set(), at, at, reason, std, at - self._resumed <= AFTER_HOLE)
+            _Open(
+                kind,
+                set(),
+                at,
+                at,
+                reason,
+                std,
+                at - self._resumed <= SILENCE_AFTER_HOLE,
+            )
         )
         self._step(self._open[-1], members, at)
 
@@ -343,7 +351,7 @@ class Recorder:
         names = tuple(self._geometry.channel_names[i] for i in channels)
         step = Step(round(at, 9), one.kind.name, names, say(self._geometry, channels))
         if one.steps and (
-            one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_STEPS
+            one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_EPISODE_STEPS
         ):
             one.steps.pop()
         one.steps.append(step)

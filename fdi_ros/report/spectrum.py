@@ -19,7 +19,7 @@ from fdi_ros.system.text import figures
 
 PIECE = 512
 """Samples of each averaged spectrum."""
-AT_ONCE = 16 * PIECE
+SAMPLES_AT_ONCE = 16 * PIECE
 """Samples that are transformed at once."""
 STANDS_OUT = 4.0
 """Smallest ratio of a line to its baseline."""
@@ -44,9 +44,9 @@ class Spectrum:
         for piece in np.split(values, cuts):
             self.begin_stretch()
             self._waiting = piece
-        while len(self._waiting) >= AT_ONCE:
-            self._average(self._waiting[:AT_ONCE])
-            self._waiting = self._waiting[AT_ONCE - PIECE // 2 :]
+        while len(self._waiting) >= SAMPLES_AT_ONCE:
+            self._average(self._waiting[:SAMPLES_AT_ONCE])
+            self._waiting = self._waiting[SAMPLES_AT_ONCE - PIECE // 2 :]
 
     def begin_stretch(self) -> None:
         """Begin a new piece at a gap."""

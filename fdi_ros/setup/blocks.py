@@ -25,7 +25,7 @@ from fdi_ros.setup.noise import projector
 #: samples looked at at once
 SPIKE_PORTION = 256
 #: windows are joined down to this number of groups
-MOST_STEPS = 400
+MOST_GROUPS = 400
 
 
 @dataclass
@@ -125,7 +125,7 @@ POINTS = 6
 #: share of a window that a channel must deliver
 PRESENT = 0.8
 #: samples worked on at once, about
-PORTION = 100_000
+PORTION_SAMPLES = 100_000
 #: smallest delay to correct, s: at 100 rad/s^2 an error of 1e-4 rad/s
 NOT_SHIFTED = 1e-6
 
@@ -174,8 +174,8 @@ class Blocks:
 
     @property
     def group_size(self) -> int:
-        """Number of windows that share one bias: at most `MOST_STEPS` groups remain."""
-        return -(-self.windows // MOST_STEPS)
+        """Number of windows that share one bias: at most `MOST_GROUPS` groups remain."""
+        return -(-self.windows // MOST_GROUPS)
 
 
 def make_blocks(data: Data, delay: Array) -> Blocks:
@@ -231,9 +231,9 @@ def resampled(data: Data, delay: Array) -> tuple[Array, Array]:
         count = 0
         usual = float(np.median(np.diff(knots))) if len(rows) > 1 else 0.0
         z[:, alike] = np.nan
-        for begin in range(0, len(z), PORTION):
+        for begin in range(0, len(z), PORTION_SAMPLES):
             first, weight = lagrange_weights(
-                knots, seconds[begin : begin + PORTION] + delay[i], usual
+                knots, seconds[begin : begin + PORTION_SAMPLES] + delay[i], usual
             )
             known = np.flatnonzero(first >= 0)
             around = rows[first[known, None] + np.arange(POINTS)]

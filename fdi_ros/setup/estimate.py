@@ -65,13 +65,13 @@ from fdi_ros.setup.smoother import (
 SCALE_STD = 0.008
 #: The same for reference channels, whose axes are taken as configured.
 REFERENCE_STD = 1e-6
-PASSES = 12
-TRUSTING = PASSES // 3
+MOST_PASSES = 12
+TRUSTING = MOST_PASSES // 3
 """First passes, which take all motion for motion, because unknown delays and scale
 errors look like vibration.
 """
 #: change of delays, s, and relative change of axes, below which a pass has settled
-SETTLED = 2e-5
+SETTLED_CHANGE = 2e-5
 #: Largest standard error of a delay that counts as known, s, and largest change of a
 #: delay in a pass from which the walk of the biases is found: a tenth of a sample at
 #: 100 Hz.
@@ -85,7 +85,7 @@ ABSENT = 1e12
 #: largest distance between means of windows at rest, in standard deviations
 SAME_REST = 5.0
 #: largest ratio of the noise in motion to the noise that is written
-LOUDER = 4.0
+MOST_VIBRATION = 4.0
 #: walk of biases that show none, rad/s/sqrt(s)
 USUAL_WALK = 2e-5
 #: Smallest number of blocks for the noise of a window, and of windows for the colour of
@@ -174,13 +174,13 @@ class StateEstimate:
     def noise_std(self) -> Array:
         """Noise of a sample of each channel (n,), rad/s: at rest, or more in motion.
 
-        The monitor accepts at most `LOUDER` times this noise as vibration when motion
+        The monitor accepts at most `MOST_VIBRATION` times this noise as vibration when motion
         begins, so the noise is at least that part of the median noise in motion.
         """
         moving = self.moment[~self.rest]
         if not len(moving):
             return self.floor.std
-        return np.maximum(self.floor.std, np.median(moving, axis=0) / LOUDER)
+        return np.maximum(self.floor.std, np.median(moving, axis=0) / MOST_VIBRATION)
 
     def disagreement(self) -> tuple[float, float]:
         """Remaining scale error between channels, rms of all components, and its uncertainty.
@@ -207,9 +207,9 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
     moved = np.inf
     blocks = make_blocks(data, taken[sensors.unit])
     walk: RandomWalk | None = None
-    for number in range(PASSES):
+    for number in range(MOST_PASSES):
         one = _Pass(blocks, priors, axes, taken, biases, number > 1, colour)
-        is_last = number == PASSES - 1
+        is_last = number == MOST_PASSES - 1
         if number > 1 and (is_last or (walk is None and moved < SHOWN_DELAY)):
             walk = find_random_walk(one.evidence)
         shown, found = one.solve(walk, number >= TRUSTING)
@@ -220,10 +220,10 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
         biases = one.curve_of(found)
         colour = one.colours(axes)
         moved = float(np.abs(delay - taken).max())
-        has_settled = moved < SETTLED and np.abs(scale).max() < SETTLED
+        has_settled = moved < SETTLED_CHANGE and np.abs(scale).max() < SETTLED_CHANGE
         if number > TRUSTING and walk is not None and has_settled:
             break
-        if moved > SETTLED:
+        if moved > SETTLED_CHANGE:
             taken = delay
             blocks = make_blocks(data, taken[sensors.unit])
         priors = _widened(sensors, axes) if number >= TRUSTING else sensors

@@ -43,7 +43,7 @@ from fdi_ros.report.layout import (
 )
 
 #: times within which a fault may be found, s
-WAITS = (0.02, 0.1, 0.5, 2.0)
+DETECTION_TIMES = (0.02, 0.1, 0.5, 2.0)
 #: times by which vibration raises the noise, where noise_std is that at rest: an
 #: example
 VIBRATION = 5.0
@@ -52,7 +52,7 @@ HARD_TO_ISOLATE = 0.9
 
 
 def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, Array]:
-    """Return the smallest errors (waits, n), rad/s, found after each of WAITS, by condition.
+    """Return the smallest errors (waits, n), rad/s, found after each of DETECTION_TIMES, by condition.
 
     Conditions are rest, a turn at integrity.max_rate, and vibration. Infinite means
     never, and NaN a wait below two samples. White noise averages out. Scale and timing
@@ -85,7 +85,7 @@ def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, 
         f"in vibration, noise {VIBRATION:g} times": (VIBRATION**2 * white, 0.0),
     }
     return {
-        name: np.array([found_within(wait, *each) for wait in WAITS])
+        name: np.array([found_within(wait, *each) for wait in DETECTION_TIMES])
         for name, each in conditions.items()
     }
 
@@ -132,7 +132,7 @@ class Mounting:
     false_alarm_probability: float
     #: (n,) error found in one sample with probability DETECTION, rad/s, or infinite
     smallest: Array
-    #: errors (waits, n), rad/s, that an optimal test finds on average within WAITS
+    #: errors (waits, n), rad/s, that an optimal test finds on average within DETECTION_TIMES
     waiting: dict[str, Array]
     #: of nothing, of each channel in turn, of each pair
     losses: tuple[Loss, ...]
@@ -274,7 +274,7 @@ def mounting_figures(result: Mounting) -> dict[str, object]:
         "smallest_within": [
             {
                 "condition": condition,
-                "within_s": list(WAITS),
+                "within_s": list(DETECTION_TIMES),
                 "rad_s": dict(zip(names, sizes.T, strict=True)),
             }
             for condition, sizes in result.waiting.items()
@@ -359,7 +359,7 @@ def fault_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
         f" {result.false_alarm_probability:.3g} a sample. Smaller faults take longer, see below."
     )
     worst = np.array([sizes.max(axis=1) for sizes in result.waiting.values()])
-    heads = [f"{wait:g} s" for wait in WAITS]
+    heads = [f"{wait:g} s" for wait in DETECTION_TIMES]
     waited = [
         Column("", list(result.waiting), ("condition",), str),
         Column("", worst, heads, _size, unit.factor),
@@ -387,7 +387,11 @@ def _waiting_figure(result: Mounting, unit: Unit) -> Figure:
             [drawn(value * unit.factor) for value in values]
             for values in (sizes.min(1), sizes.max(1))
         )
-        look = {"x": list(WAITS), "name": condition, "line": {"color": colour_of(k)}}
+        look = {
+            "x": list(DETECTION_TIMES),
+            "name": condition,
+            "line": {"color": colour_of(k)},
+        }
         data.append(
             {"type": "band", **look, "low": low, "high": high, "showlegend": False}
         )

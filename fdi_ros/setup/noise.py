@@ -26,7 +26,7 @@ from fdi_ros.model.samples import Array, Int, Mask
 LEAST_VARIANCE = LEAST_NOISE**2
 #: windows on both sides that the noise of the moment is averaged over: 5 s, in which
 #: vibration stays
-MEMORY = 2
+NEIGHBOURS = 2
 
 
 @dataclass(frozen=True)
@@ -104,11 +104,11 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
     Neighbouring windows are averaged.
     """
     filled = np.where(there[:, :, None] & there[:, None, :], covariance, 0.0)
-    near = np.pad(filled, ((MEMORY, MEMORY), (0, 0), (0, 0)))
-    beside = np.pad(there, ((MEMORY, MEMORY), (0, 0)))
+    near = np.pad(filled, ((NEIGHBOURS, NEIGHBOURS), (0, 0), (0, 0)))
+    beside = np.pad(there, ((NEIGHBOURS, NEIGHBOURS), (0, 0)))
     total = np.zeros_like(filled)
     weight = np.zeros(len(filled))
-    for shift in reversed(range(2 * MEMORY + 1)):
+    for shift in reversed(range(2 * NEIGHBOURS + 1)):
         # The mean of covariances of other channels would be none.
         same = (there == beside[shift : shift + len(there)]).all(axis=1)
         total += np.where(same[:, None, None], near[shift : shift + len(there)], 0.0)

@@ -22,12 +22,12 @@ from fdi_ros.model.samples import Array, Int
 from fdi_ros.setup.noise import information, projector
 
 #: as data sheets state it, 0.01 to 1 %
-USUAL = 2e-3
+USUAL_NONLINEARITY = 2e-3
 #: largest standard error with which a nonlinearity counts as measured: half of the
 #: usual one
 MEASURED = 1e-3
 #: signals of a channel: bias, three of scale, drift, asymmetry, odd order
-SIGNALS = 7
+TERMS = 7
 
 
 class Nonlinearity(NamedTuple):
@@ -78,36 +78,36 @@ def measure(
         return Nonlinearity(0.0, np.inf)
     along = rate @ axes.T
     largest = np.maximum(np.abs(along).max(axis=0), 1e-9)
-    signals = np.zeros((len(along), n, SIGNALS))
+    signals = np.zeros((len(along), n, TERMS))
     signals[:, :, 0] = 1.0
     signals[:, :, 1:4] = rate[:, None, :]
     signals[:, :, 4] = ((time - time.mean()) / max(np.ptp(time), 1.0))[:, None]
     signals[:, :, 5] = np.abs(along)
     signals[:, :, 6] = along * np.abs(along) / largest
-    normal = np.zeros((n, SIGNALS, n, SIGNALS))
-    right = np.zeros((n, SIGNALS))
+    normal = np.zeros((n, TERMS, n, TERMS))
+    right = np.zeros((n, TERMS))
     known = information(variance, axes)
     for w in np.unique(window):
         rows = window == w
         part = signals[rows]
-        products = np.tensordot(part, part, (0, 0))  # (n, SIGNALS, n, SIGNALS)
+        products = np.tensordot(part, part, (0, 0))  # (n, TERMS, n, TERMS)
         normal += known[w][:, None, :, None] * products
         right += np.einsum("bik,bi->ik", part, residual[rows] @ known[w])
     # Before anything is shown: no gyro is as bad.
-    prior = np.full((n, SIGNALS), 0.3)
+    prior = np.full((n, TERMS), 0.3)
     prior[:, [0, 4]] = bias_std
     prior[:, 1:4] = np.maximum(scale_std, 1e-6)[:, None]
-    size = n * SIGNALS
+    size = n * TERMS
     covariance = np.linalg.inv(
         normal.reshape(size, size) + np.diag(prior.ravel() ** -2.0)
     )
-    found = (covariance @ right.ravel()).reshape(n, SIGNALS)
-    each: Array = np.asarray(covariance).reshape(n, SIGNALS, n, SIGNALS)
+    found = (covariance @ right.ravel()).reshape(n, TERMS)
+    each: Array = np.asarray(covariance).reshape(n, TERMS, n, TERMS)
     # Asymmetry and nonlinearity of odd order.
     squares = [_mean_square(found[:, k], each[:, k, :, k], axes) for k in (5, 6)]
     value = float(np.sqrt(max(sum(square for square, _ in squares), 0.0)))
     spread = float(np.sqrt(sum(error**2 for _, error in squares)))
-    return Nonlinearity(value, spread / (2.0 * max(value, USUAL)))
+    return Nonlinearity(value, spread / (2.0 * max(value, USUAL_NONLINEARITY)))
 
 
 def _mean_square(shares: Array, covariance: Array, axes: Array) -> tuple[float, float]:
@@ -118,6 +118,6 @@ def _mean_square(shares: Array, covariance: Array, axes: Array) -> tuple[float, 
     counts = variance > 1e-6 * variance.max()
     variance = variance[counts]
     along = (directions.T @ shares)[counts]
-    weight = (variance + USUAL**2) ** -2.0
+    weight = (variance + USUAL_NONLINEARITY**2) ** -2.0
     square = np.average(along**2 - variance, weights=weight)
     return float(square), float(np.sqrt(2.0 / weight.sum()))

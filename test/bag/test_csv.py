@@ -185,7 +185,7 @@ def test_an_imu_without_values_in_a_line_has_no_message_there(
     tmp_path, monkeypatch, portion
 ):
     """Two IMUs of their own rates in one table; a damaged number is one, not a lost message; a second table is left."""
-    monkeypatch.setattr("fdi_ros.bag.csv_file._PORTION", portion)
+    monkeypatch.setattr("fdi_ros.bag.csv_file._READ_BYTES", portion)
     path = write(tmp_path, named("imu_{k}.{axis}"))
     lines = path.read_text().splitlines()
     again = lines[1:]

@@ -310,9 +310,9 @@ def test_dropouts_of_the_logger_are_told(tmp_path):
 def test_what_is_read_does_not_depend_on_the_portions(tmp_path, kind, monkeypatch):
     path = log(tmp_path, kind)
     whole = messages(path)
-    monkeypatch.setattr(dataflash, "_PORTION", 5000)
+    monkeypatch.setattr(dataflash, "_PORTION_BYTES", 5000)
     monkeypatch.setattr(ulog.Ulog, "together", 50)
-    monkeypatch.setattr(flight_log, "_TOGETHER", 64)
+    monkeypatch.setattr(flight_log, "_LOG_BATCH", 64)
     cut = messages(path)
     assert cut[1] == whole[1]
     assert [one[2] for one in cut[0].values()] == [one[2] for one in whole[0].values()]
@@ -489,7 +489,7 @@ def test_a_sensor_logged_before_and_after_its_filters_is_read_once(
 @pytest.mark.parametrize("gps", [True, False])
 def test_a_log_ends_where_the_time_steps_back(tmp_path, kind, gps, monkeypatch):
     """There the log of another flight begins; its GPS says nothing of the first."""
-    monkeypatch.setattr(dataflash, "_PORTION", 50_000)
+    monkeypatch.setattr(dataflash, "_PORTION_BYTES", 50_000)
     path = log(tmp_path, kind, units(seconds=8.0, start=11.0, apart=137), gps=gps)
     data = path.read_bytes()
     whole = messages(path)[0]

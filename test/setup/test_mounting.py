@@ -23,8 +23,8 @@ from fdi_ros.model.noise import (
     summary_line,
 )
 from fdi_ros.setup.mounting import (
+    DETECTION_TIMES,
     VIBRATION,
-    WAITS,
     assess,
     loss,
     mounting_text,
@@ -93,14 +93,14 @@ def test_an_error_as_large_as_stated_is_found_in_the_time_stated():
     # Of a wait shorter than two samples nothing is said.
     assert np.isnan(
         assess(config.replaced({"sample_rate": 25.0})).waiting["at rest"][
-            WAITS.index(0.02)
+            DETECTION_TIMES.index(0.02)
         ]
     ).all()
     # A stream with that error, whitened: the CUSUM of the channel's own direction.
     V, R = result.geometry.parity, np.diag(result.noise.noise_std**2)
     inverse = np.linalg.inv(V @ R @ V.T)
     own = float(V[:, 2] @ inverse @ V[:, 2])
-    shift = rest[WAITS.index(0.5), 2] * math.sqrt(own)
+    shift = rest[DETECTION_TIMES.index(0.5), 2] * math.sqrt(own)
     assert moustakides_delay(
         shift, 1 / result.false_alarm_probability
     ) == pytest.approx(50, rel=0.03)
