@@ -29,6 +29,8 @@ compiler makes millions of objects that last, and the default costs a seventh of
 FIRST_REPORT = 2.0
 """Time from the notice to the first report of progress, s: by then some twenty functions are compiled."""
 REPORT_PERIOD = 5.0  # s
+LEAST_SHARE = 0.2
+"""Share of the functions from which on the time left is reported. The first ones are small and say little."""
 _PASS = "numba:run_pass"
 """Event of Numba: a compiler pass.
 
@@ -121,7 +123,8 @@ def progress_logged(
     done
         Returns the names of the functions that were compiled so far.
 
-    The time left assumes that the rest of the functions takes as long as those that are done.
+    The time left, reported once a fifth of the functions is done, assumes that the rest takes as
+    long for each function.
     """
     LOG.warning(WORDS)
     begun = time.monotonic()
@@ -138,11 +141,13 @@ def progress_logged(
             share = count / len(functions)
             spent = time.monotonic() - begun
             LOG.warning(
-                "compiling |%-20s| %d of %d functions, about %.0f s left",
+                "compiling |%-20s| %d of %d functions%s",
                 "#" * round(20 * share),
                 count,
                 len(functions),
-                spent / share - spent,
+                f", about {spent / share - spent:.0f} s left"
+                if share >= LEAST_SHARE
+                else "",
             )
 
     thread = threading.Thread(target=report, daemon=True)

@@ -34,6 +34,8 @@ LEAST_MISSING_S = 1.0
 """Time without a fused rate that is reported, s. Shorter outages are in the notes."""
 LEAST_NOISY_S = 3.0
 """Duration of noise that is reported, s."""
+LEAST_RESIDUAL = 1e-9
+"""Smallest residual that counts as measured, rad/s, as the smallest ``noise.noise_std``."""
 LEAST_SHARE = 1e-3
 """Smallest share of the errors of a channel that is taken to show in its residual."""
 LEAST_SPIKES = 3
@@ -164,7 +166,7 @@ def own_noise(residual_rms: Array, axes: Array) -> Array:
     axes
         Sensitivity axes, (n, 3).
     """
-    square = np.where(residual_rms > 0.0, residual_rms, np.nan) ** 2
+    square = np.where(residual_rms > LEAST_RESIDUAL, residual_rms, np.nan) ** 2
     known = np.isfinite(square)
     variance = square.copy()
     for _ in range(PASSES):

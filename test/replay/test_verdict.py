@@ -191,6 +191,7 @@ def test_own_noise_is_that_of_the_channel_and_not_of_its_weight():
     residual = np.sqrt((left**2) @ noise**2)
     assert residual[3] > 3 * residual[0]
     assert own_noise(residual, axes) == pytest.approx(noise, rel=1e-3)
+    assert np.isnan(own_noise(np.full(9, 1e-160), axes)).all()
     residual[4] = np.nan
     assert np.isfinite(own_noise(residual, axes)).tolist() == [k != 4 for k in range(9)]
 
