@@ -111,6 +111,13 @@ def no_common_time(reports: Sequence[TopicReport]) -> str:
     spans = [(one.topic.name, *one.stamps) for one in reports if one.stamps is not None]
     if not spans:
         return ""
+    if set_back := [one for one in spans if one[2] < one[1]]:
+        names = listed([shown(name) for name, _, _ in set_back])
+        longest = max(first - last for _, first, last in set_back) * 1e-9
+        return (
+            f"the last stamps of {names} are up to {figures(longest)} s before the first: a clock was"
+            " set while they were recorded"
+        )
     _, origin, end = spans[0]
     apart = [one for one in spans if one[1] > end or one[2] < origin]
     if not apart:

@@ -295,6 +295,23 @@ def test_stamps_of_other_clocks_are_said_by_replay_itself(
     assert f"/imu_1/data {words}" in said
 
 
+@pytest.mark.parametrize("units", [(1,), (0, 1, 2)])
+def test_a_clock_that_was_set_while_recording_is_said(units, tmp_path, refused):
+    time, rates = drive(seconds=20.0)
+    messages = []
+    for k, unit in enumerate(rates):
+        back = np.where((time > 10.0) & np.isin(k, units), 3600.0, 0.0)
+        for at, stamp, rate in zip(time, time - back, unit, strict=True):
+            log, stamp = (START + round(1e9 * one) for one in (at, stamp))
+            messages.append((f"/imu_{k}/data", log, imu(stamp, rate)))
+    messages.sort(key=lambda one: one[1])
+    write_mcap(tmp_path / "bag.mcap", messages)
+    names = "/imu_1/data" if units == (1,) else "/imu_0/data, /imu_1/data and /imu_2/"
+    said = refused("replay", tmp_path / "bag.mcap")
+    assert f"needs one clock: the last stamps of {names}" in said
+    assert "are up to 3580 s before the first: a clock was set while they" in said
+
+
 @pytest.mark.parametrize("late", [0.15, -0.4, 0.9])
 def test_stamps_beyond_the_time_that_is_waited_are_no_lost_data(
     late, tmp_path, fdi, refused
