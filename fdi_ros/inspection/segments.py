@@ -175,7 +175,12 @@ def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
     return np.median(noise[quiet], axis=0), np.median(block[quiet], axis=0)
 
 
+LARGEST_VALUE = 1e9
+"""Bound of a value, rad/s or m/s^2: squares of the largest numbers overflow."""
+
+
 def _segment(values: Array, first: int) -> NoiseSegment:
+    values = np.clip(values, -LARGEST_VALUE, LARGEST_VALUE)
     means = values.reshape(REST_BLOCKS, -1, values.shape[1]).mean(axis=1)
     least = _noise(means)
     std = values.std(axis=0)
