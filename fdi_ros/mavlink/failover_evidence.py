@@ -295,7 +295,11 @@ class RawComparison:
         mean = late.mean(axis=0)
         spread = late.std(axis=0, ddof=1)
         std = spread / math.sqrt(count)
-        steady = np.abs(mean) >= SMOOTH * _roughness(late)
+        # A hole may hide half of an oscillation, so the time before it counts as well.
+        ahead = max(before - after for before, after in pairwise(ages[-count:]))
+        span = 2 * AVERAGED if ahead > QUICK else AVERAGED
+        seen = values[-max(count, sum(age < span for age in ages)) :]
+        steady = np.abs(seen.mean(axis=0)) >= SMOOTH * _roughness(seen)
         if (~steady & (np.abs(mean) >= spread)).any():
             steady |= _lasts(values, np.array(ages) // AVERAGED)
         x, y, z = (tuple(row.tolist()) for row in (mean, spread, std))
