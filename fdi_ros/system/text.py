@@ -63,7 +63,10 @@ def first_of(
 def did_you_mean(word: str, choices: Sequence[str]) -> str:
     """Return a hint for a word that is none of the choices: the closest one, and a short list."""
     # Comparing very long words takes long and cannot succeed.
-    close = difflib.get_close_matches(word, choices, n=1) if len(word) <= WORD else []
+    # The dashes of options make all options alike.
+    plain = {choice.lstrip("-"): choice for choice in choices}
+    short = word.lstrip("-") if len(word) <= WORD else ""
+    close = [plain[one] for one in difflib.get_close_matches(short, plain, n=1)]
     # Which other number was meant, nobody can guess.
     other_number = close and _without_digits(word) == _without_digits(close[0])
     hint = f"did you mean {close[0]!r}?" if close and not other_number else ""

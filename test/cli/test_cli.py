@@ -524,6 +524,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     [
         ("replya x", "no such VERB: 'replya', did you mean 'replay'?"),
         ("replay x --confg y", "has no option '--confg', did you mean '--config'?"),
+        ("replay x --topics y", "has no option '--topics', expected one of: --config"),
         ("fleet x --output y --calibrate eech", "did you mean 'each'?"),
     ],
 )
