@@ -25,9 +25,9 @@ import contextlib
 import csv
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, Protocol
 
 import numpy as np
 
@@ -92,6 +92,13 @@ _ENTRIES = {
     "acceleration_unit",
     "accelerations",
 }
+
+
+class Note(Protocol):
+    """Takes notes on the choice of columns."""
+
+    def __call__(self, line: str, names: str = "", why: str = "") -> None:
+        """Note a line, and the names of columns of a gyro that are left out, and why."""
 
 
 class Columns(NamedTuple):
@@ -213,9 +220,7 @@ def unit_numbers(paths: Sequence[Path]) -> list[int]:
     return numbers if len(set(numbers)) == len(paths) else list(range(len(paths)))
 
 
-def find_columns(
-    file: BinaryIO, note: Callable[..., None], first: int = 0
-) -> tuple[str, Columns]:
+def find_columns(file: BinaryIO, note: Note, first: int = 0) -> tuple[str, Columns]:
     """Return the delimiter and the columns to read, and move the file behind the names.
 
     ``first``: number of the first IMU. `BagError` if no line holds names, or no name is
@@ -271,9 +276,7 @@ class _Choice(NamedTuple):
         ]
 
 
-def _columns(
-    file: BinaryIO, names: Sequence[str], note: Callable[..., None], first: int
-) -> Columns:
+def _columns(file: BinaryIO, names: Sequence[str], note: Note, first: int) -> Columns:
     """Choose the columns and note the choice.
 
     `BagError` if no gyro is found, or ``columns.yaml`` names other columns.
@@ -292,9 +295,7 @@ def _columns(
     return columns
 
 
-def _chosen_names(
-    file: BinaryIO, names: Sequence[str], note: Callable[..., None]
-) -> _Choice:
+def _chosen_names(file: BinaryIO, names: Sequence[str], note: Note) -> _Choice:
     """Choose columns by ``columns.yaml`` in the folder of a table, else by their names."""
     path = Path(file.name).parent / COLUMNS
     given = read_yaml(path, "file", BagError) if path.exists() else {}
@@ -336,9 +337,7 @@ def _places(
     return tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in triads)
 
 
-def _note_choice(
-    choice: _Choice, columns: Columns, note: Callable[..., None], first: int
-) -> None:
+def _note_choice(choice: _Choice, columns: Columns, note: Note, first: int) -> None:
     """Note which columns are read, and in which units."""
     source = COLUMNS if "imus" in choice.given else "their names"
     imus = "; ".join(
@@ -409,7 +408,7 @@ def _triads(names: Sequence[str]) -> dict[tuple[str, str], dict[str, str]]:
     return groups
 
 
-def _imus(names: Sequence[str], note: Callable[..., None]) -> list[list[str]]:
+def _imus(names: Sequence[str], note: Note) -> list[list[str]]:
     """Return the columns x, y, z of each gyro, by names of gyros, or else by any names.
 
     A gyro that lacks an axis is noted and left out.
