@@ -679,9 +679,8 @@ class Core:
     # or NaN
     reference: Channels
     witnesses: Counts  # channels that the reference of each is predicted from
-    reference_input: (
-        Square  # values of all channels at the time of each reference, rad/s
-    )
+    # values of all channels at the time of each reference, rad/s
+    reference_input: Square
     saturated: Flag  # a manoeuvre has driven a channel out of range
     saturated_stamp: Whole  # last sample with a saturated channel, ns
     samples: Whole  # so far

@@ -110,11 +110,11 @@ def is_confirmed(
     now = core.now
     axes = core.settings.sensors.axes
     n = core.settings.n
+    for k in range(n):
+        now.moved[k] = now.input[k] - core.reference_input[i, k]
     for j in range(n):
         if others >> j & 1 and abs(along(axes[i], axes[j])) > MIN_SENSITIVITY:
             rest = others & ~(1 << j)
-            for k in range(n):
-                now.moved[k] = now.input[k] - core.reference_input[i, k]
             fill_rate(subsets[rest], n, rest, now.moved, now.others_rate)
             # Without a rate the comparison is false.
             if not abs(along(axes[i], now.others_rate)) > least:

@@ -111,9 +111,8 @@ class Difference(NamedTuple):
 class Compared(NamedTuple):
     """How far two IMUs are apart now, by axis, rad/s. NaN: unknown."""
 
-    apart: (
-        Vector  #: If steady, or a wild oscillation. 0: what a mean leaves of another.
-    )
+    #: If steady, or a wild oscillation. 0: what a mean leaves of another.
+    apart: Vector
     bound: Vector  #: A bound that two that agree keep: mean, or scatter from `CALM` on.
     mean: Vector  #: Steady or not.
 
