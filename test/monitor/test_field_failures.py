@@ -161,6 +161,8 @@ def test_quiet_values_repeat_beside_a_channel_that_fails_by_noise(units, size):
     z[1000:, 1] += size * rng.standard_normal(1500)
     output = pipeline.process(Block(stamp, np.round(z, 3)))
     assert {name for name, state in declarations(pipeline, output)} <= {"imu_1.y"}
+    failed = pipeline.status().channels[1]
+    assert failed.state == ChannelState.FAULTY or failed.counts["noisy"] > 500
     after = output.rate[1000:] - output.rate[500:1000].mean(axis=0)
     nees = np.einsum(
         "ki,kij,kj->k", after, np.linalg.inv(output.covariance[1000:]), after
