@@ -168,9 +168,18 @@ class Draw(random.Random):
         )()
 
 
-SOUND = Draw("sound")
-SOUND.oddness = 0.0
-"""Makes nothing odd."""
+class Sound(Draw):
+    """Makes nothing odd and damages nothing."""
+
+    def __init__(self):
+        super().__init__("sound")
+        self.oddness = 0.0
+
+    def damaged(self, data):
+        return data
+
+
+SOUND = Sound()
 
 
 # Recordings ----------------------------------------------------------------------------------------------------------
