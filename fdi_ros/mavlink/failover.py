@@ -34,6 +34,8 @@ from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.system.clocks import Clocks
 
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
+#: Bit mask of the IMUs that have an EKF lane. ArduPilot takes it over at its start.
+EKF_LANES = "EK3_IMU_MASK"
 #: Failover compares more samples than the topics of the monitor get. At 50 Hz a gyro that
 #: vibrates with a multiple of 50 Hz seems to have a slow error. 111 Hz show the vibration
 #: up to half of that, and the multiples of 111 Hz hardly pass the autopilot's filter.
@@ -102,6 +104,7 @@ class Failover:
         self._system = saved.system
         self._state = PolicyState.begin(count, saved.out)
         self._values: list[tuple[bool | None, int]] = [(None, 0)] * count
+        self._lanes: int | None = None  # of `EKF_LANES`. None: not reported
         self._conversation = 0
         self._boots = 0
         self._booted: int | None = None  # when the autopilot started, ns
@@ -236,6 +239,7 @@ class Failover:
 
     def _forget(self) -> None:
         self._values = [(None, 0)] * len(self._values)
+        self._lanes = None
 
     def _read(self, now: int) -> None:
         """Take the reports of parameters, and ask for the next."""
@@ -251,12 +255,18 @@ class Failover:
             # What comes beside old samples is as old, perhaps from before our orders.
             if name in names and not is_late:
                 self._values[names.index(name)] = (value != 0, now)
+            elif name == EKF_LANES and 0 <= value < 256:
+                # A bit that is set later counts only from the next start on.
+                known = 255 if self._lanes is None else self._lanes
+                self._lanes = known & int(value)
         usual = READ_EVERY if vehicle.armed else READ_ON_GROUND
         pause = READ_HURRIED if self._hurry else usual
         if vehicle.in_reach and now - self._read_at >= pause:
             self._read_at = now
             for name in names:
                 vehicle.read_parameter(name)
+            if self._lanes is None or not vehicle.armed:
+                vehicle.read_parameter(EKF_LANES)
 
     def _view(self, now: int, restore: bool = False) -> View:
         vehicle = self._vehicle
@@ -268,11 +278,12 @@ class Failover:
             for k in range(len(self._values))
         ]
         imus: list[Imu] = []
-        for imu, (use, heard) in zip(
-            evidence.look(delivers, self.out, now), self._values, strict=True
-        ):
-            is_known = is_same and now - heard < FORGOTTEN
-            imus.append(imu._replace(use=use if is_known else None, heard=heard))
+        lanes = 255 if self._lanes is None else self._lanes
+        for k, imu in enumerate(evidence.look(delivers, self.out, now)):
+            use, heard = self._values[k]
+            if not is_same or now - heard >= FORGOTTEN:
+                use = None
+            imus.append(imu._replace(use=use, heard=heard, lane=bool(lanes >> k & 1)))
         reported = self.reported >= evidence.begun and now - self.reported < ABSENT
         return View(
             imus=tuple(imus),
@@ -362,8 +373,10 @@ class Failover:
                 (not memory.acquainted, f"{name} not seen to agree yet"),
                 (imu.agreed is None, f"{name} agrees with none"),
                 (not imu.judged, f"{name} is not judged"),
+                (not imu.lane, f"{EKF_LANES} is without {name}"),
             ]
         checks += [
+            (self._lanes is None, f"{EKF_LANES} is not reported"),
             (bool(self._file.trouble), "failover_file is not usable"),
             (len(names) < 3, "two IMUs: no third to decide"),
         ]

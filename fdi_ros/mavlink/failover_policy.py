@@ -101,7 +101,7 @@ class Condition(Enum):
     ALONE = "one IMU is alive, or none but samples arrive, armed"
     REDUNDANT = "two or more IMUs in use that agree, and EKF lanes that are not lost"
     LAST_IMU = "one IMU in use, or none, because of our orders"
-    LAST_LANE = "one EKF lane, or none, is not lost, armed"
+    LAST_LANE = "one EKF lane, or none, is not lost, and others are, armed"
 
 
 #: Announced every `REPEAT`.
@@ -132,6 +132,7 @@ class Imu(NamedTuple):
     delivers: bool = False  #: Its samples arrive.
     stuck: bool = False  #: They repeat one value while another IMU moves.
     judged: bool = True  #: The monitor judges at least one of its channels.
+    lane: bool = True  #: The autopilot has an EKF lane for it, as far as is known.
     size: float = float("nan")
     """Largest raw difference to the nearest IMU of late, rad/s. NaN: unknown."""
     #: Not apart from a sound IMU since this time. None: apart, stuck or unknown. If the
@@ -498,12 +499,14 @@ def _conditions(
     )
     alive = sum(not _has_stood(memory.dead_since, REACTION, now) for memory in memories)
     left = sum(memory.seen is not False for memory in memories)
-    lanes = sum(memory.lane_angle < LOST_LANE for memory in memories)
+    pairs = zip(memories, view.imus, strict=True)
+    angles = [memory.lane_angle for memory, imu in pairs if imu.lane]
+    lanes = sum(angle < LOST_LANE for angle in angles)
     by_us = any(memory.ours and memory.seen is False for memory in memories)
     checks = (
         (view.armed and is_heard and alive <= 1, Condition.ALONE),
         (view.armed and by_us and left <= 1, Condition.LAST_IMU),
-        (view.armed and lanes <= 1, Condition.LAST_LANE),
+        (view.armed and lanes <= 1 and lanes < len(angles), Condition.LAST_LANE),
         (view.armed and differs and not is_any_ok, Condition.DISAGREE),
     )
     found.append((VEHICLE, _first(checks, Condition.REDUNDANT)))

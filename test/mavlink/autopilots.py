@@ -13,7 +13,8 @@ ArduPilot's parameters outlive a restart, come as float, are said to all wheneve
 value when that is refused; it flies with the first IMU that is in use.
 Seen in ArduCopter 4.6.3's own simulation: a read is answered up to 100 ms late, from another thread, with the value of
 when it was read (`late_reads`); EKF lane k follows IMU k, or the first IMU in use while IMU k is out (`lanes`); notch
-filters are allocated at the start, only for IMUs in use then (`notches`).
+filters are allocated at the start, only for IMUs in use then (`notches`), and EKF lanes for the IMUs in EK3_IMU_MASK,
+of which the start removes those that do not exist.
 """
 
 import contextlib
@@ -77,6 +78,7 @@ MESSAGES = {
     129: "scaled_imu3",
 }
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
+EKF_LANES = "EK3_IMU_MASK"
 
 
 @dataclass(eq=False)
@@ -101,7 +103,7 @@ class Autopilot:
     commands: list[tuple[int, ...]] = field(default_factory=list)
     refuses: set[int] = field(default_factory=set)
     parameters: dict[str, float] = field(
-        default_factory=lambda: dict.fromkeys(PARAMETERS, 1.0)
+        default_factory=lambda: {**dict.fromkeys(PARAMETERS, 1.0), EKF_LANES: 7.0}
     )
     read_only: set[str] = field(default_factory=set)
     sets: list[tuple[int, str, float]] = field(
@@ -134,7 +136,7 @@ class Autopilot:
         self.random = np.random.default_rng(self.seed + 1)
         self._beat = self._asked = 0
         self._answers: list[tuple[int, str, float]] = []  # when, ns; name and value
-        self.notches = self._allocate_notches()
+        self._allocate()
         self._lock = threading.Lock()
 
     @property
@@ -148,17 +150,22 @@ class Autopilot:
     def lanes(self) -> list[int]:
         """IMU that each EKF lane follows, from 0."""
         used = [bool(self.parameters[name]) for name in PARAMETERS[: self.units]]
-        return [k if used[k] else self.flies_with for k in range(self.units)]
+        own = [k for k in range(self.units) if self.has_lane >> k & 1]
+        return [k if used[k] else self.flies_with for k in own]
 
-    def _allocate_notches(self) -> list[bool]:
+    def _allocate(self) -> None:
         known = [self.parameters.get(name, 0.0) for name in PARAMETERS[: self.units]]
-        return [bool(value) for value in known]
+        self.notches = [bool(value) for value in known]
+        existing = (1 << self.units) - 1
+        self.has_lane = int(self.parameters.get(EKF_LANES, 0)) & existing
+        if EKF_LANES in self.parameters:
+            self.parameters[EKF_LANES] = float(self.has_lane)
 
     def reboot(self, now: int) -> None:
         """Start anew: the clock begins at zero, intervals are forgotten."""
         with self._lock:
             self.boot, self._beat = now, 0
-            self.notches = self._allocate_notches()
+            self._allocate()
             self.intervals.clear()
             self.due.clear()
 
@@ -440,7 +447,12 @@ class Conversation:
     def _send(self, data: bytes, peer: Any) -> None:
         message = self._check.parse_char(data)
         assert message.get_type() in HARMLESS or (
-            self.may_set and message.param_id in PARAMETERS
+            self.may_set
+            and (
+                message.param_id in PARAMETERS
+                or (message.get_type(), message.param_id)
+                == ("PARAM_REQUEST_READ", EKF_LANES)
+            )
         )
         assert message.get_type() != "COMMAND_LONG" or message.command == 511
         assert message.get_type() != "TIMESYNC" or message.tc1 == 0

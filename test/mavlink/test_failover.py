@@ -26,6 +26,7 @@ from fdi_ros.mavlink.failover_policy import Condition, PolicySettings
 from fdi_ros.mavlink.failover_words import WORDS, imu_name, imu_text
 from fdi_ros.system.clocks import Clocks
 from mavlink.autopilots import (
+    EKF_LANES,
     NS,
     PARAMETERS,
     UTC,
@@ -884,6 +885,40 @@ def test_what_cannot_be_seen_is_not_ready(flying: Monitored, tmp_path: Path) -> 
     two = Monitored(tmp_path, Autopilot("ardupilot", units=2))
     two.autopilots[0].parameters.pop("INS_USE3")
     assert reason(two.run(15.0)) == "no failover: use of IMU 3 is not reported"
+
+
+def test_an_imu_without_an_ekf_lane_is_not_ready(tmp_path: Path) -> None:
+    """ArduPilot's default has two lanes, and changes them at its start only."""
+    autopilot = Autopilot("ardupilot", parameters=dict.fromkeys(PARAMETERS, 1.0))
+    talk = Monitored(tmp_path, autopilot).run(12.0)
+    assert reason(talk) == "no failover: EK3_IMU_MASK is not reported"
+    autopilot.parameters[EKF_LANES] = 3.0
+    assert reason(talk.run(1.0)) == "no failover: EK3_IMU_MASK is without IMU 3"
+    autopilot.parameters[EKF_LANES] = 7.0
+    assert reason(talk.run(5.0)) == "no failover: EK3_IMU_MASK is without IMU 3"
+    autopilot.reboot(talk.now)
+    assert reason(talk.run(12.0)) == "ready"
+
+
+@pytest.mark.parametrize(("mask", "lost"), [(7, 2), (3, 1), (1, 1)])
+def test_of_the_lanes_that_exist_the_last_one_is_announced(
+    tmp_path: Path, mask: int, lost: int
+) -> None:
+    """A vehicle with one lane flies without that text, until this lane is lost."""
+    autopilot = Autopilot("ardupilot")
+    autopilot.parameters[EKF_LANES] = mask
+    autopilot.reboot(0)
+    talk = Monitored(tmp_path, autopilot).run(12.0)
+    autopilot.armed = True
+    talk.run(3.0)
+    words = f"no failover: EK3_IMU_MASK is without IMU {mask.bit_length() + 1}"
+    assert (words in talk.texts) is (mask < 7)
+    autopilot.read_only.update(PARAMETERS)
+    for imu in range(1, lost + 1):
+        assert not any("lane" in text for text in talk.texts)
+        talk.fault(imu, 2.5, seconds=1.5)
+        talk.heal(imu, 1.0)
+    assert "one EKF lane left: land" in talk.texts
 
 
 def test_a_monitor_that_was_silent_is_believed_after_its_next_report(
