@@ -32,7 +32,7 @@ from fdi_ros.bag.library_log import Columns, LibraryLog
 from fdi_ros.bag.modes import VEHICLES, ardupilot_mode, px4_heartbeat_mode
 from fdi_ros.mavlink.protocol import (
     ARDUPILOT,
-    MESSAGES,
+    IMU_MESSAGES,
     MOST_UNITS,
     NO_AUTOPILOT,
     RAW,
@@ -47,7 +47,7 @@ from fdi_ros.system.files import (
     TLOG_BYTES,
 )
 
-_IMUS = tuple(message.name for message in MESSAGES.values())
+_IMUS = tuple(message.name for message in IMU_MESSAGES.values())
 _OTHER_MESSAGES = (
     "HEARTBEAT",
     "PARAM_VALUE",
@@ -84,7 +84,7 @@ class Tlog(LibraryLog):
 
     magic = b"\0"
     refusal = "is no log of a ground station (.tlog)"
-    kinds = tuple(dict.fromkeys(message.kind for message in MESSAGES.values()))
+    kinds = tuple(dict.fromkeys(message.kind for message in IMU_MESSAGES.values()))
     settings = "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"
     one_imu = (
         "one IMU cannot be checked: this autopilot sent no other ({}). If the board has more, it should send"
@@ -110,12 +110,12 @@ class Tlog(LibraryLog):
             if message.get_srcSystem() != self.system:
                 continue
             came = int.from_bytes(data[at : at + _TIME], "big")
-            if (number := message.get_msgId()) not in MESSAGES:
+            if (number := message.get_msgId()) not in IMU_MESSAGES:
                 beside.append((came, message))
                 del beside[_MOST_BESIDE:]
-            elif understood(MESSAGES[number].kind, autopilot):
+            elif understood(IMU_MESSAGES[number].kind, autopilot):
                 self._take_sample(found, message, data[at:end], came, end)
-        raw, scaled = (Source(MESSAGES[number].kind, 0) for number in (RAW, SCALED))
+        raw, scaled = (Source(IMU_MESSAGES[number].kind, 0) for number in (RAW, SCALED))
         if raw in found and scaled not in found:
             found[scaled] = found.pop(raw)
         tables = {
@@ -143,7 +143,7 @@ class Tlog(LibraryLog):
     ) -> None:
         """Take a message of an IMU. ``came``: us since 1970. ``end``: of its record."""
         number = message.get_msgId()
-        kind = MESSAGES[number].kind
+        kind = IMU_MESSAGES[number].kind
         self.counts[kind] += 1
         payload = _TIME + (10 if record[_TIME] == 0xFD else 6)
         reading = read(number, record[payload : payload + record[_TIME + 1]])
@@ -178,7 +178,7 @@ class Tlog(LibraryLog):
         """Return the message of a source: SCALED_IMU2."""
         own = numbers(source.kind)
         if len(own) > source.instance:
-            return MESSAGES[own[source.instance]].name
+            return IMU_MESSAGES[own[source.instance]].name
         return f"{source.kind} id {source.instance}"
 
     def _autopilot(self, data: bytes) -> tuple[int, int] | None:

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from fdi_ros.mavlink.failover_evidence import CURRENT, SILENT, Evidence
+from fdi_ros.mavlink.failover_evidence import CURRENT, SILENCE, Evidence
 from fdi_ros.mavlink.failover_file import FailoverFile, Saved
 from fdi_ros.mavlink.failover_policy import (
     VEHICLE,
@@ -26,14 +26,14 @@ from fdi_ros.mavlink.failover_policy import (
     is_apart,
     objection,
 )
-from fdi_ros.mavlink.failover_words import WORDS, imu_name, imu_text
+from fdi_ros.mavlink.failover_words import CONDITION_WORDS, imu_name, imu_text
 from fdi_ros.mavlink.protocol import ARDUPILOT, ENOUGH, MS, NS, ImuSample
-from fdi_ros.mavlink.report import INFO, LENGTH, WARNING
+from fdi_ros.mavlink.report import INFO, TEXT_LENGTH, WARNING
 from fdi_ros.mavlink.vehicle import Vehicle
 from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.system.clocks import Clocks
 
-PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
+INS_USE = ("INS_USE", "INS_USE2", "INS_USE3")
 #: Bit mask of the IMUs that have an EKF lane. ArduPilot takes it over at its start.
 EKF_LANES = "EK3_IMU_MASK"
 #: Failover compares more samples than the topics of the monitor get. At 50 Hz a gyro that
@@ -43,15 +43,19 @@ OVERSAMPLING = 20 / 9
 READ_EVERY = 100 * MS  #: Time between two readings of the parameters in flight, ns.
 READ_ON_GROUND = NS // 2  #: The same on the ground, ns.
 READ_HURRIED = 50 * MS  #: The same while an order may depend on the parameters, ns.
-FORGOTTEN = 10 * NS  #: An older report of a parameter is not known any more, ns.
-ABSENT = 5 * NS  #: A monitor without diagnostics for this time is in doubt, ns.
-LATE = 1.0  #: Age of the newest judged sample from which the monitor is late, s.
-LOSSY = 0.1  #: Largest share of lost messages at which failover is ready.
-SLOW = 300 * MS  #: Longest round trip at which failover is ready, ns.
+USE_KNOWN_FOR = 10 * NS  #: An older report of a parameter is not known any more, ns.
+REPORTED_WITHIN = (
+    5 * NS
+)  #: A monitor without diagnostics for this time is in doubt, ns.
+LARGEST_AGE = 1.0  #: Age of the newest judged sample from which the monitor is late, s.
+LARGEST_LOSS = 0.1  #: Largest share of lost messages at which failover is ready.
+READY_TRIP = 300 * MS  #: Longest round trip at which failover is ready, ns.
 MONITOR_LATE = "the monitor is late"
 SIZING = 200 * MS  #: Longest wait of a text for the size of an error, ns.
 COUNTED = 5 * NS  #: Losses are counted over this time, ns.
-STEADY = 3 * NS  #: Readiness must have changed for this time to be announced, ns.
+ANNOUNCED_AFTER = (
+    3 * NS
+)  #: Readiness must have changed for this time to be announced, ns.
 BOOT_STEP = 3 * NS  #: A boot time that grows by more is another boot, ns,
 BACKLOG = 10 * NS  #: if the autopilot's time has gone back, or after this time, ns.
 SAME_BOOT = 10.0  #: Largest difference of two times of one start of the autopilot, s.
@@ -153,7 +157,7 @@ class Failover:
         self._state = decision.state
         self._hurry = decision.hurry
         for imu, use in decision.orders:
-            self._vehicle.set_parameter(PARAMETERS[imu], float(use))
+            self._vehicle.set_parameter(INS_USE[imu], float(use))
         for imu, condition in decision.words:
             if condition == Condition.OUT:
                 self._unsized[imu] = now
@@ -247,7 +251,7 @@ class Failover:
         if vehicle.begun != self._conversation:
             self._conversation = vehicle.begun
             self._forget()
-        names = PARAMETERS[: len(self._values)]
+        names = INS_USE[: len(self._values)]
         stamps = [track.stamp for track in vehicle.units.values()]
         is_late = now - max(stamps, default=0) > CURRENT
         while vehicle.parameters:
@@ -274,17 +278,19 @@ class Failover:
         # Parameters of another system do not count for the one with an IMU out.
         is_same = vehicle.system == self._system or not self.out
         delivers = [
-            k in vehicle.units and now - vehicle.units[k].last < SILENT
+            k in vehicle.units and now - vehicle.units[k].last < SILENCE
             for k in range(len(self._values))
         ]
         imus: list[Imu] = []
         lanes = 255 if self._lanes is None else self._lanes
         for k, imu in enumerate(evidence.look(delivers, self.out, now)):
             use, heard = self._values[k]
-            if not is_same or now - heard >= FORGOTTEN:
+            if not is_same or now - heard >= USE_KNOWN_FOR:
                 use = None
             imus.append(imu._replace(use=use, heard=heard, lane=bool(lanes >> k & 1)))
-        reported = self.reported >= evidence.begun and now - self.reported < ABSENT
+        reported = (
+            self.reported >= evidence.begun and now - self.reported < REPORTED_WITHIN
+        )
         return View(
             imus=tuple(imus),
             linked=vehicle.in_reach
@@ -294,7 +300,7 @@ class Failover:
             and is_same,
             armed=vehicle.armed,
             disarmed=vehicle.disarmed,
-            monitored=self.is_alone and now - evidence.heard < SILENT and reported,
+            monitored=self.is_alone and now - evidence.heard < SILENCE and reported,
             boots=self._boots,
             restore=restore,
         )
@@ -302,7 +308,7 @@ class Failover:
     def _announce(
         self, imu: int, condition: Condition, error: tuple[str, float] | None = None
     ) -> None:
-        severity, words = WORDS[condition]
+        severity, words = CONDITION_WORDS[condition]
         of_imu = imu_text(imu, condition, self._channels, error)
         self._say(severity, f"FDI: {words}" if imu == VEHICLE else of_imu)
 
@@ -330,13 +336,15 @@ class Failover:
         if why != self._ready[0]:
             self._ready = (why, now)
         is_late = why == MONITOR_LATE
-        if not vehicle.in_reach or (now - self._ready[1] < STEADY and not is_late):
+        if not vehicle.in_reach or (
+            now - self._ready[1] < ANNOUNCED_AFTER and not is_late
+        ):
             return
         # An IMU that is out of use is announced by itself.
         if why != self._told and not self.out and (view.armed or not why):
             self._told = why
             words = f"no failover: {why}" if why else "failover is ready"
-            self._say(WARNING if why else INFO, f"FDI: {words}"[:LENGTH])
+            self._say(WARNING if why else INFO, f"FDI: {words}"[:TEXT_LENGTH])
 
     def _not_ready(self, view: View, now: int) -> str:
         """Return why a fault might go unanswered now. Empty: every fault would be answered."""
@@ -351,10 +359,10 @@ class Failover:
             against.append(objection(k, memories, trial, now, self._settings))
         trip = self._vehicle.sync.trip(now)
         checks = [
-            (not self.age <= LATE, MONITOR_LATE),
-            (self._lost > LOSSY, "link loses messages"),
+            (not self.age <= LARGEST_AGE, MONITOR_LATE),
+            (self._lost > LARGEST_LOSS, "link loses messages"),
             (self._is_slow(view, now), "IMUs come too slowly"),
-            (trip is None or trip > SLOW, "link is slow"),
+            (trip is None or trip > READY_TRIP, "link is slow"),
         ]
         checks += [
             (bool(why and imu.use), why)

@@ -33,20 +33,22 @@ DECAY = 0.5
 REFUTING = 300 * MS  #: Agreement refutes a doubt that has stood for this time, ns.
 BREAK = 100 * MS  #: A shorter break ends no agreement, and no difference, ns.
 HEALED = NS // 2  #: Time of agreement after which an earlier size is forgotten, ns.
-LASTING = 300 * MS  #: A set must stand for this time to name an IMU, ns,
-GAP = 200 * MS  #: without a break longer than this, ns.
+SET_STANDS = 300 * MS  #: A set must stand for this time to name an IMU, ns,
+LONGEST_BREAK = 200 * MS  #: without a break longer than this, ns.
 VOTE = 2.0  #: Least error of the odd one in a set of several IMUs, in ``min_size``.
-LARGE = 0.3  #: Difference from which any doubt of the monitor names the odd IMU, rad/s.
+LARGE_DIFFERENCE = (
+    0.3  #: Difference from which any doubt of the monitor names the odd IMU, rad/s.
+)
 #: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
 #: 0.2 s to exclude a spike. An autopilot whose primary gyro reads zero is at 50 deg then.
-CLEAR = 0.5
+CLEAR_DIFFERENCE = 0.5
 #: Share of the rate by which two healthy gyros may differ: scales of one type differ by up
-#: to 3 %, which is more than `CLEAR` in a turn of 17 rad/s.
+#: to 3 %, which is more than `CLEAR_DIFFERENCE` in a turn of 17 rad/s.
 SCALE = 0.05
 #: A difference is steady if it is a smooth curve: its mean is this multiple of its step
 #: from sample to sample, over the root of 2. ArduPilot sends what is due each 9 ms at the
 #: turns of its loop, so vibration reaches more only within 1 Hz of 111 Hz.
-SMOOTH = 5.0
+SMOOTHNESS = 5.0
 #: Or if it lasts: in this number of times `AVERAGED` in turn all means have one sign and
 #: are at least as large as the standard deviation.
 WINDOWS = 4
@@ -56,26 +58,28 @@ TURNED = 300 * MS
 CALM = 0.1
 #: It agrees, like one that is out of use, only once another one has turned by this on
 #: average, rad/s: a dead gyro agrees with one at rest.
-TURNING = 0.1
-WILD = 1.0  #: An oscillation with this standard deviation is an error, rad/s.
+TURN_RATE = 0.1
+WILD_OSCILLATION = (
+    1.0  #: An oscillation with this standard deviation is an error, rad/s.
+)
 SKEW = 20 * MS  #: Two IMUs may measure this far apart in time, ns.
 #: Allowed for in a mean difference, ns: more would hide errors while the vehicle shakes.
 USUAL_SKEW = 5 * MS
-#: The last samples must all differ by `LARGE` or `CLEAR`: those of at least this time,
-#: ns, and at least `FEWEST` of them.
+#: The last samples must all differ by `LARGE_DIFFERENCE` or `CLEAR_DIFFERENCE`: those of
+#: at least this time, ns, and at least `FEWEST` of them.
 QUICK = 50 * MS
 FEWEST = 3  #: Smallest number of samples in `QUICK`.
 SIZED = 80 * MS  #: The size in a text is averaged over this time, ns.
-WHOLE = 0.5  #: Share of the largest axis from which a second one is off as well.
+SECOND_AXIS = 0.5  #: Share of the largest axis from which a second one is off as well.
 ALIKE = 0.05  #: Two IMUs agree within this share of the odd one's difference, too.
 TRUSTED = 2 * NS  #: IMUs are trusted after all have agreed for this time, ns.
 #: A gyro is stuck if it repeats one value for this time, ns, while the rates of two others
-#: change by `MOVED`, or the rate of one by this and `NOISE` standard deviations: a bad gyro
-#: scatters also at rest.
+#: change by `PROVEN_MOTION`, or the rate of one by this and `NOISE` standard deviations: a
+#: bad gyro scatters also at rest.
 REPEATING = 100 * MS
-MOVED = 0.02  #: Change of rate that proves a motion, rad/s.
+PROVEN_MOTION = 0.02  #: Change of rate that proves a motion, rad/s.
 NOISE = 4.0
-ENDS = 4  #: Samples averaged at the begin and at the end of that time.
+END_SAMPLES = 4  #: Samples averaged at the begin and at the end of that time.
 #: States of channels that are a doubt.
 DOUBTS = {
     ChannelState.SUSPECT,
@@ -85,12 +89,12 @@ DOUBTS = {
 }
 #: States of channels of which a fault would not be seen.
 UNJUDGED = {ChannelState.UNCHECKED, ChannelState.EXCLUDED, ChannelState.STALE}
-CERTAIN = 5.0  #: Standard deviations from which a size is known.
-SILENT = NS // 2  #: An IMU without samples for this time does not deliver, ns.
-FORGOTTEN = 5 * NS  #: Older states of the monitor are unknown, ns.
+KNOWN_SIGMAS = 5.0  #: Standard deviations from which a size is known.
+SILENCE = NS // 2  #: An IMU without samples for this time does not deliver, ns.
+STATES_KNOWN_FOR = 5 * NS  #: Older states of the monitor are unknown, ns.
 KEPT = 64  #: Samples kept of each IMU.
 
-UNKNOWN: Vector = (math.nan, math.nan, math.nan)
+UNKNOWN_RATES: Vector = (math.nan, math.nan, math.nan)
 NOBODY: tuple[int, set[int], int] = (-1, set(), 0)
 
 
@@ -117,7 +121,7 @@ class Compared(NamedTuple):
     mean: Vector  #: Steady or not.
 
 
-UNCOMPARED = Compared(UNKNOWN, UNKNOWN, UNKNOWN)
+UNCOMPARED = Compared(UNKNOWN_RATES, UNKNOWN_RATES, UNKNOWN_RATES)
 
 
 class RawComparison:
@@ -140,7 +144,7 @@ class RawComparison:
         self._averaged = max(1, AVERAGED // interval)
         #: Fewest samples that are averaged, and the number of those within `QUICK`.
         self.fewest = max(FEWEST, QUICK // interval + 1)
-        self._last: list[tuple[int, Vector]] = [(-NS, UNKNOWN)] * count
+        self._last: list[tuple[int, Vector]] = [(-NS, UNKNOWN_RATES)] * count
         self._recent: list[deque[Vector]] = [deque(maxlen=KEPT) for _ in range(count)]
         self._pairs: dict[tuple[int, int], deque[tuple[int, Vector]]] = {
             (j, k): deque(maxlen=256) for k in range(count) for j in range(k)
@@ -148,7 +152,7 @@ class RawComparison:
         # Samples since the value of an IMU changed, and the rates of all IMUs at first.
         self._same = [0] * count
         self._repeating = max(FEWEST, REPEATING // interval)
-        self._beside = [[UNKNOWN] * count] * count
+        self._beside = [[UNKNOWN_RATES] * count] * count
         self._stuck = [False] * count
 
     def feed(self, unit: int, stamp: int, rate: Vector) -> None:
@@ -182,7 +186,7 @@ class RawComparison:
         moved = [
             k
             for k, (_, rate) in enumerate(self._last)
-            if k != unit and math.dist(rate, self._beside[unit][k]) > MOVED
+            if k != unit and math.dist(rate, self._beside[unit][k]) > PROVEN_MOTION
         ]
         if len(moved) > 1:
             return True
@@ -191,15 +195,15 @@ class RawComparison:
     def _has_turned(self, unit: int, count: int) -> bool:
         """Return whether the rate of an IMU has changed by more than its noise.
 
-        From the first to the last `ENDS` of its last count samples.
+        From the first to the last `END_SAMPLES` of its last count samples.
         """
         # The oldest may be from before: IMUs are fed in turn.
         rates = np.array(list(self._recent[unit])[2 - count :])
-        if len(rates) < 2 * ENDS:
+        if len(rates) < 2 * END_SAMPLES:
             return False
-        noise = np.std(np.diff(rates, axis=0)) / math.sqrt(ENDS)
-        change = rates[-ENDS:].mean(axis=0) - rates[:ENDS].mean(axis=0)
-        return bool(np.linalg.norm(change) > MOVED + NOISE * noise)
+        noise = np.std(np.diff(rates, axis=0)) / math.sqrt(END_SAMPLES)
+        change = rates[-END_SAMPLES:].mean(axis=0) - rates[:END_SAMPLES].mean(axis=0)
+        return bool(np.linalg.norm(change) > PROVEN_MOTION + NOISE * noise)
 
     def _rates(self, unit: int) -> list[Vector]:
         """Return the rates of an IMU within `AVERAGED`, rad/s."""
@@ -260,13 +264,13 @@ class RawComparison:
         """
         rows = self._rows(unit, other, now)
         if len(rows) < self.fewest:
-            return UNKNOWN
-        if max(map(abs, rows[-1][1])) < LARGE:
+            return UNKNOWN_RATES
+        if max(map(abs, rows[-1][1])) < LARGE_DIFFERENCE:
             return 0.0, 0.0, 0.0
         before = np.array([row for at, row in rows if at > rows[-1][0] - TURNED])
         values = before[-self.fewest :]
         least = np.array(list(map(_steady, values.T.tolist())))
-        smooth = np.abs(values.mean(axis=0)) >= SMOOTH * _roughness(values)
+        smooth = np.abs(values.mean(axis=0)) >= SMOOTHNESS * _roughness(values)
         turned = (2.0 * before * np.sign(least) < -np.abs(least)).any(axis=0)
         x, y, z = np.where(smooth & ~turned, least, 0.0).tolist()
         return x, y, z
@@ -298,7 +302,7 @@ class RawComparison:
         ahead = max(before - after for before, after in pairwise(ages[-count:]))
         span = 2 * AVERAGED if ahead > QUICK else AVERAGED
         seen = values[-max(count, sum(age < span for age in ages)) :]
-        steady = np.abs(seen.mean(axis=0)) >= SMOOTH * _roughness(seen)
+        steady = np.abs(seen.mean(axis=0)) >= SMOOTHNESS * _roughness(seen)
         if (~steady & (np.abs(mean) >= spread)).any():
             steady |= _lasts(values, np.array(ages) // AVERAGED)
         x, y, z = (tuple(row.tolist()) for row in (mean, spread, std))
@@ -335,7 +339,7 @@ def _nearest(found: Sequence[Vector]) -> Vector:
     """Return the smallest of the differences of an IMU to its partners."""
     # One difference that is unknown may be the one in which the IMU agrees.
     if not found or any(map(math.isnan, map(max, found))):
-        return UNKNOWN
+        return UNKNOWN_RATES
     return min(found, key=max)
 
 
@@ -375,7 +379,7 @@ class Evidence:
         self._sized = SIZED // interval
         # States of the three channels of each IMU. Empty: unknown.
         self._states: list[tuple[ChannelState, ...]] = [()] * count
-        self._sizes = [UNKNOWN] * count  # largest of late, by axis, rad/s
+        self._sizes = [UNKNOWN_RATES] * count  # largest of late, by axis, rad/s
         # Doubts of the monitor that agreement has refuted. None: the IMU is not trusted.
         self._refuted: list[set[ChannelState] | None] = [None] * count
         # Doubts of the monitor about each IMU, and since when, ns.
@@ -398,7 +402,7 @@ class Evidence:
 
     def hear(self, states: Sequence[float], now: int) -> None:
         """Take the states of all channels, numbers of `ChannelState`, at time now, ns."""
-        if now - self.heard >= SILENT:
+        if now - self.heard >= SILENCE:
             self.begun = now
         self.heard = now
         found = [ChannelState(int(state)) for state in states]
@@ -417,7 +421,7 @@ class Evidence:
             IMUs, from 0, out of use by our orders. Two bad IMUs may agree with each
             other, so agreement with these counts only while they are trusted.
         """
-        if now - self.heard >= FORGOTTEN:
+        if now - self.heard >= STATES_KNOWN_FOR:
             self._states = [()] * len(delivers)
         units = [k for k, does in enumerate(delivers) if does]
         self._compare(units, now)
@@ -425,7 +429,7 @@ class Evidence:
         odd, axes, lasting = self._odd_one(units, now)
         if odd == self._odd:
             self._odd_seen = now
-        elif odd >= 0 or now - self._odd_seen > GAP:
+        elif odd >= 0 or now - self._odd_seen > LONGEST_BREAK:
             self._odd = odd
             self._odd_since = self._odd_seen = now
         if now - self._odd_since < lasting:
@@ -497,9 +501,9 @@ class Evidence:
         for axis, mean in enumerate(difference.mean):
             spread = difference.spread[axis]
             size = max(0.0, abs(mean) - scale - shifts[axis])
-            is_wild = math.hypot(mean, spread) >= WILD + scale
-            is_steady = difference.steady[axis] or abs(quick[axis]) >= LARGE
-            apart = size if is_steady else WILD if is_wild else 0.0
+            is_wild = math.hypot(mean, spread) >= WILD_OSCILLATION + scale
+            is_steady = difference.steady[axis] or abs(quick[axis]) >= LARGE_DIFFERENCE
+            apart = size if is_steady else WILD_OSCILLATION if is_wild else 0.0
             axes.append((apart, max(size, spread if spread >= CALM else 0.0), size))
         return Compared(*zip(*axes, strict=True))
 
@@ -538,7 +542,7 @@ class Evidence:
             self._agreed[unit] = self._agreed[unit] or now
             # A mean that is no steady error yet may be the begin or end of a turn.
             alike = [k for k in agreeing if self._agree(unit, k, doubted=True)]
-            if any(self.raw.turn(k) >= TURNING for k in alike):
+            if any(self.raw.turn(k) >= TURN_RATE for k in alike):
                 self._turned[unit] = self._turned[unit] or now
         must_turn = doubted or is_out
         return self._turned[unit] if must_turn else self._agreed[unit]
@@ -623,8 +627,8 @@ class Evidence:
         Also return its axes, and for how long this must last before it counts, ns.
         `NOBODY` if there is none.
 
-        Of three IMUs it is the one that is off by `CLEAR` while the two others agree,
-        or by less if the monitor doubts it too. Otherwise it is the only IMU with a
+        Of three IMUs it is the one that is off by `CLEAR_DIFFERENCE` while the two others
+        agree, or by less if the monitor doubts it too. Otherwise it is the only IMU with a
         set. If one of two others is not trusted, a set proves nothing: two IMUs that
         fail alike put the healthy third one into a set.
         """
@@ -640,9 +644,9 @@ class Evidence:
                 if min(size[axis] for size in sizes) >= VOTE * self._min_size
             }
             if axes:
-                return k, axes, LASTING
+                return k, axes, SET_STANDS
         sets = {k: self._axes(k, ChannelState.AMBIGUOUS) for k in units}
-        found = [(k, axes, LASTING) for k, axes in sets.items() if axes]
+        found = [(k, axes, SET_STANDS) for k, axes in sets.items() if axes]
         if len(found) != 1:
             return NOBODY
         others = [k for k in units if k != found[0][0]]
@@ -657,7 +661,9 @@ class Evidence:
         first, second = (k for k in units if k != unit)
         count = self.raw.fewest
         turning = max(self.raw.rate(first), self.raw.rate(second))
-        limit = (LARGE if self._doubts(unit) else CLEAR) + SCALE * turning
+        limit = (
+            LARGE_DIFFERENCE if self._doubts(unit) else CLEAR_DIFFERENCE
+        ) + SCALE * turning
         rows = zip(
             self.raw.steady(unit, first, now),
             self.raw.steady(unit, second, now),
@@ -675,7 +681,7 @@ class Evidence:
         """Return the axis on which an IMU is off most, and by how much, rad/s.
 
         Measured against the IMU that the monitor finds OK, or else against the nearest.
-        None: not known to `CERTAIN` standard deviations, or not of one axis.
+        None: not known to `KNOWN_SIGMAS` standard deviations, or not of one axis.
         """
         found = [
             (not imu.ok, difference.size, difference)
@@ -687,9 +693,9 @@ class Evidence:
         mean, _, std, _ = min(found)[2]
         axis = max(range(3), key=lambda k: abs(mean[k]))
         others = [abs(mean[k]) for k in range(3) if k != axis]
-        if max(others) > WHOLE * abs(mean[axis]):
+        if max(others) > SECOND_AXIS * abs(mean[axis]):
             # A whole unit is off: its error is no more than the motion of the vehicle.
             return None
-        if not abs(mean[axis]) > CERTAIN * std[axis]:
+        if not abs(mean[axis]) > KNOWN_SIGMAS * std[axis]:
             return None
         return "xyz"[axis], mean[axis]

@@ -18,7 +18,7 @@ from typing import NamedTuple
 from fdi_ros.errors import ConfigError
 from fdi_ros.system.files import read_trusted, replacing
 
-LARGEST = 4096  #: Largest file that is read, bytes.
+LARGEST_FILE = 4096  #: Largest file that is read, bytes.
 
 
 class Saved(NamedTuple):
@@ -76,7 +76,7 @@ class FailoverFile:
 
     def _read(self, count: int) -> Saved:
         try:
-            found = json.loads(read_trusted(self._path, LARGEST))
+            found = json.loads(read_trusted(self._path, LARGEST_FILE))
             out = tuple(int(imu) - 1 for imu in found["out_of_use"])
             if not set(out) <= set(range(count)):
                 raise ValueError

@@ -20,7 +20,7 @@ Definitions
     ours     out of use by our order, or perhaps so: from the moment the order is sent
              until the autopilot reports "in use" `SETTLED` after it
     seen     INS_USE as reported. A change that we have not ordered counts once it has
-             stood for `LASTING`: ArduPilot may answer a read with the value from before
+             stood for `CHANGE_STANDS`: ArduPilot may answer a read with the value from before
              our order
     held     wanted out of use
 
@@ -29,7 +29,7 @@ Definitions
 Rules, in this order at each tick
     1. A held IMU goes back in use if the operator asks; if every other IMU is dead or out
        of use; or if the IMU has not been apart for a pause, counted from a turn: at rest
-       a gyro that has lost its scale agrees too. The pause is `PAUSE`, doubled each time
+       a gyro that has lost its scale agrees too. The pause is `FIRST_PAUSE`, doubled each time
        the IMU is taken out in one flight. In flight the last case needs a live monitor,
        and an IMU that the monitor finds OK goes back at once if all that are in use are
        bad. On the ground the IMU stays out until the monitor finds it OK. An IMU that
@@ -63,10 +63,10 @@ SETTLED = 2 * NS
 #: A report against our order is ignored for this time after the order, ns: ArduPilot
 #: answers a read up to 100 ms late, with the value from the time of reading.
 STALE_ANSWER = NS // 2
-LASTING = NS  #: A change that we have not ordered counts after this time, ns.
-PAUSE = 2 * NS  #: An IMU goes back after this time without being apart, ns.
+CHANGE_STANDS = NS  #: A change that we have not ordered counts after this time, ns.
+FIRST_PAUSE = 2 * NS  #: An IMU goes back after this time without being apart, ns.
 LONGEST_PAUSE = 16 * NS  #: Bound of the doubled pause, ns.
-RETRY = 100 * MS  #: Time between the first `QUICK_TRIES` copies of an order, ns.
+QUICK_RETRY = 100 * MS  #: Time between the first `QUICK_TRIES` copies of an order, ns.
 QUICK_TRIES = 10
 SLOW_RETRY = NS  #: Time between further copies, ns.
 GROUNDED = 2 * NS  #: The flight is over after this time disarmed, ns.
@@ -78,7 +78,7 @@ REPEAT = 10 * NS  #: Time between two announcements of a lasting danger, ns.
 #: ArduCopter's simulation lanes recover from 0.4 rad within 10 s, and never from 3 rad.
 LOST_LANE = 1.5
 LANE_RECOVERY = 10.0  #: Time constant with which a lane recovers from less, s.
-NEVER = -(10**18)  #: A time before all others, ns.
+LONG_AGO = -(10**18)  #: A time before all others, ns.
 
 
 class Condition(Enum):
@@ -125,7 +125,7 @@ class Imu(NamedTuple):
     """Present state of one IMU. Times in ns."""
 
     use: bool | None = None  #: Last report of its INS_USE. None: no recent report.
-    heard: int = NEVER  #: Time of that report.
+    heard: int = LONG_AGO  #: Time of that report.
     named: bool | None = None  #: By the monitor or the raw rates. None: no reports.
     blamed: bool = False  #: Named on an axis that is apart, as defined above.
     ok: bool = False  #: The monitor finds all its channels OK.
@@ -159,8 +159,8 @@ class Memory:
     ours: bool = False
     held: bool = False
     seen: bool | None = None  #: INS_USE as last reported. None: not since the boot.
-    out_sent: int = NEVER  #: When the last order "out of use" was sent.
-    back_sent: int = NEVER  #: When the last order "in use" was sent.
+    out_sent: int = LONG_AGO  #: When the last order "out of use" was sent.
+    back_sent: int = LONG_AGO  #: When the last order "in use" was sent.
     tries: int = 0  #: Copies sent of the present order.
     taken: int = 0  #: Number of times taken out in this flight.
     left_alone: bool = False
@@ -196,7 +196,7 @@ class PolicyState(NamedTuple):
     memories: tuple[Memory, ...]
     announced: Mapping[int, Announced] = {}
     boots: int = 0
-    at: int = NEVER  #: Time of the last tick.
+    at: int = LONG_AGO  #: Time of the last tick.
 
     @classmethod
     def begin(
@@ -366,12 +366,12 @@ def _hear(memory: Memory, use: bool, heard: int) -> None:
     ordered_at = max(memory.out_sent, memory.back_sent)
     # Without an order of this run, the last run's order counts.
     ordered = memory.back_sent > memory.out_sent
-    expected = (memory.seen,) if ordered_at == NEVER else (memory.seen, ordered)
+    expected = (memory.seen,) if ordered_at == LONG_AGO else (memory.seen, ordered)
     if use not in expected and not is_first:
         since = heard if memory.against_since is None else memory.against_since
         if heard - ordered_at < STALE_ANSWER:
             return
-        if heard - since < LASTING:
+        if heard - since < CHANGE_STANDS:
             memory.against_since = since
             return
     memory.against_since = None
@@ -385,7 +385,7 @@ def _hear(memory: Memory, use: bool, heard: int) -> None:
     else:
         # Out before and now in use: not by us. Never reported out to this run: the
         # order was lost.
-        by_others = use and changed and memory.out_sent != NEVER
+        by_others = use and changed and memory.out_sent != LONG_AGO
     is_over = use and settled
     memory.seen = use
     if by_others or (memory.ours and is_over):
@@ -429,7 +429,7 @@ def _release(
     )
     only_bad = all(memory.ours or is_bad(imu, settings) for memory, imu in pairs)
     for memory, imu in pairs:
-        pause = min(PAUSE << max(0, memory.taken - 1), LONGEST_PAUSE)
+        pause = min(FIRST_PAUSE << max(0, memory.taken - 1), LONGEST_PAUSE)
         agrees = _has_stood(imu.agreed, pause, now)
         may = view.monitored if view.armed else imu.ok
         heals = agrees and may and is_alive(imu)
@@ -469,7 +469,7 @@ def _is_due(
     memory = memories[k]
     imu = view.imus[k]
     last = memory.out_sent if memory.held else memory.back_sent
-    pause = RETRY if memory.tries < QUICK_TRIES else SLOW_RETRY
+    pause = QUICK_RETRY if memory.tries < QUICK_TRIES else SLOW_RETRY
     if not view.linked or (memory.tries and now - last < pause):
         return False
     if memory.held:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from fdi_ros.mavlink.failover_policy import Condition
-from fdi_ros.mavlink.report import CRITICAL, INFO, LENGTH, WARNING
+from fdi_ros.mavlink.report import CRITICAL, INFO, TEXT_LENGTH, WARNING
 
 
 class Words(NamedTuple):
@@ -19,7 +19,7 @@ class Words(NamedTuple):
     text: str  #: What follows "FDI: ", or for an IMU "FDI: IMU 1 ".
 
 
-WORDS = {
+CONDITION_WORDS = {
     Condition.FINE: Words(INFO, "in use, differs no more"),
     Condition.DANGER: Words(CRITICAL, "faulty AND IN USE: land"),
     Condition.OUT: Words(CRITICAL, "out of use"),
@@ -66,9 +66,11 @@ def imu_text(
         z down.
     """
     # ArduPilot's parameters are INS_USE, INS_USE2, INS_USE3.
-    words = WORDS[condition].text.format(imu + 1 if imu else "")
+    words = CONDITION_WORDS[condition].text.format(imu + 1 if imu else "")
     if error is not None:
         axis, size = error
         words += f" (gyro {axis} {size if axis == 'x' else -size:+.2f} rad/s)"
     text = f"FDI: {imu_name(imu, channels)} {words}"
-    return (text if len(text) <= LENGTH else f"FDI: IMU {imu + 1} {words}")[:LENGTH]
+    return (text if len(text) <= TEXT_LENGTH else f"FDI: IMU {imu + 1} {words}")[
+        :TEXT_LENGTH
+    ]

@@ -33,7 +33,7 @@ from fdi_ros.system.files import open_regular
 
 MOST_AT_ONCE = 1 << 15  #: Bytes read before others get their turn.
 MOST_WAITING = 1 << 12  #: Bytes that may wait to be sent: half a second of a slow line.
-RETRY = NS  #: Time between two attempts to open a link, ns.
+REOPEN_EVERY = NS  #: Time between two attempts to open a link, ns.
 _DATAGRAM = 1 << 11
 _UNREACHABLE = (
     errno.ECONNREFUSED,
@@ -85,7 +85,7 @@ class Link:
             if self._handle is None:
                 if now < self._attempt:
                     return []
-                self._attempt = now + RETRY
+                self._attempt = now + REOPEN_EVERY
                 self.trouble = "connecting"
                 self._handle = self._make()
             if self.trouble and self._is_connected():
@@ -232,14 +232,14 @@ def open_link(url: str) -> Link:
 KEY_BYTES = 32
 BLOCK = 13  #: Bytes of a signature: link id, time, and 6 of the digest.
 EPOCH = 1_420_070_400  #: Unix time from which signatures count, s: 2015.
-STEPS = 100_000  #: Steps of time in a second.
-LATE = 60 * STEPS  #: Largest delay of a new sender, steps.
+STEPS_PER_SECOND = 100_000  #: Steps of time in a second.
+LARGEST_DELAY = 60 * STEPS_PER_SECOND  #: Largest delay of a new sender, steps.
 _SENDERS = 16  # largest number of links of the autopilot
 
 
 def now_in_steps(seconds: float) -> int:
     """Return the time of a signature for a Unix time."""
-    return max(0, round((seconds - EPOCH) * STEPS))
+    return max(0, round((seconds - EPOCH) * STEPS_PER_SECOND))
 
 
 def read_key(path: str) -> bytes:
@@ -294,8 +294,8 @@ class Verifier:
         if sender in self._latest:
             if time <= self._latest[sender]:
                 return False
-        elif time < now - LATE:
-            self.behind = (now - time) / STEPS
+        elif time < now - LARGEST_DELAY:
+            self.behind = (now - time) / STEPS_PER_SECOND
             return False
         elif len(self._latest) >= _SENDERS:
             return False

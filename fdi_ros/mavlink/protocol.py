@@ -59,7 +59,7 @@ class ImuMessage(NamedTuple):
 
 _MILLI = (1e-3, 1e-3 * STANDARD_GRAVITY)
 _SCALED = ("SCALED_IMU", 24, struct.Struct("<I6h"), 1000, *_MILLI)
-MESSAGES: dict[int, ImuMessage] = {
+IMU_MESSAGES: dict[int, ImuMessage] = {
     message.number: message
     for message in (
         ImuMessage("SCALED_IMU", 26, *_SCALED, unit=0),
@@ -94,7 +94,7 @@ SCALED, RAW = 26, 27  #: SCALED_IMU of IMU 1, and RAW_IMU, which may replace SCA
 def numbers(kind: str) -> tuple[int, ...]:
     """Return the ids of the messages of a kind, in the order of the units."""
     return tuple(
-        message.number for message in MESSAGES.values() if message.kind == kind
+        message.number for message in IMU_MESSAGES.values() if message.kind == kind
     )
 
 
@@ -132,11 +132,11 @@ class Thinning:
 
 
 def read(number: int, payload: bytes, zeros: bool = False) -> ImuSample | None:
-    """Return the sample in a payload of one of `MESSAGES`, or None without a new gyro sample.
+    """Return the sample in a payload of one of `IMU_MESSAGES`, or None without a new gyro sample.
 
     zeros: a payload of zeros is a sample. Else it has no IMU, but a magnetometer.
     """
-    message = MESSAGES[number]
+    message = IMU_MESSAGES[number]
     data = payload.ljust(message.size, b"\0")
     time, *values = message.head.unpack_from(data)
     if not any(values) and not zeros:
@@ -166,12 +166,12 @@ def understood(kind: str, autopilot: int) -> bool:
 
 
 DEFAULT_INTERVAL = 0
-PATIENCE = NS  #: An acknowledgement may take this time, ns.
+ACKNOWLEDGED_WITHIN = NS  #: An acknowledgement may take this time, ns.
 TRIES = 3
 AGAIN = 10 * NS  #: Time after which a slow message is requested again, ns.
 AGAIN_REFUSED = 60 * NS  #: Time after which a refused message is requested again, ns.
 ENOUGH = 0.8  #: Share of the requested rate that is enough.
-RESULTS = (
+COMMAND_RESULTS = (
     "accepted",
     "refused for now",
     "denied",
@@ -180,7 +180,7 @@ RESULTS = (
     "in progress",
     "cancelled",
 )  #: MAV_RESULT
-_HOPEFUL = ("not asked yet", RESULTS[5])
+_HOPEFUL = ("not asked yet", COMMAND_RESULTS[5])
 
 
 @dataclass
@@ -215,7 +215,7 @@ class Streams:
         """Return whether the request of a message failed."""
         return number in self._wanted and self._wanted[number].answer not in (
             *_HOPEFUL,
-            RESULTS[0],
+            COMMAND_RESULTS[0],
         )
 
     def ask_again(self) -> None:
@@ -233,7 +233,7 @@ class Streams:
         """Return message id and interval, us, of a request to be sent now, or None."""
         while self._queue:
             wanted = self._wanted[self._queue[0]]
-            if wanted.tries and now < wanted.asked + PATIENCE:
+            if wanted.tries and now < wanted.asked + ACKNOWLEDGED_WITHIN:
                 return None
             if wanted.tries < TRIES:
                 wanted.asked = now
@@ -247,7 +247,9 @@ class Streams:
         """Take an acknowledgement (MAV_RESULT) of the request under way."""
         if self._queue and (wanted := self._wanted[self._queue[0]]).tries:
             wanted.answer = (
-                RESULTS[result] if 0 <= result < len(RESULTS) else f"result {result}"
+                COMMAND_RESULTS[result]
+                if 0 <= result < len(COMMAND_RESULTS)
+                else f"result {result}"
             )
             if wanted.answer not in _HOPEFUL:
                 del self._queue[0]
@@ -276,9 +278,9 @@ DRIFT = 1e-4  #: Largest drift between two clocks.
 SLEW = 1e-3
 STEP = 20 * MS  #: A better offset further away is taken at once, ns.
 GRAIN = MS  #: Largest step of the times in answers, ns.
-LONGEST = NS  #: Longer round trips are ignored, ns.
+LONGEST_TRIP = NS  #: Longer round trips are ignored, ns.
 LATELY = 5 * NS  #: A link is as slow as its round trips of this time, ns.
-SURE = 3  #: Contradicting times or answers in a row that are believed.
+BELIEVED_AFTER = 3  #: Contradicting times or answers in a row that are believed.
 _KEPT = 64  # largest number of round trips, and of requests under way
 FIRST_FOR = 20  #: Number of requests at the short interval `FIRST_EVERY`.
 FIRST_EVERY = NS // 10  #: Interval of the first requests, ns.
@@ -323,7 +325,7 @@ class TimeSync:
             return False
         self._sent.remove(sent)
         trip = now - sent
-        if not 0 <= trip <= LONGEST:
+        if not 0 <= trip <= LONGEST_TRIP:
             return False
         offset = remote - (sent + trip // 2)
         half = trip // 2
@@ -332,7 +334,7 @@ class TimeSync:
             for at, other, less in self._trips
         ]
         self._odd = self._odd + 1 if any(far) else 0
-        if 0 < self._odd < SURE:
+        if 0 < self._odd < BELIEVED_AFTER:
             return False
         # Trips that several answers contradict are older than a step of the clock.
         self._trips = deque(
@@ -436,7 +438,7 @@ class BootClock:
             self._lead = max(lead, time - now)
             return time
         self._odd += 1
-        if self._odd >= SURE:
+        if self._odd >= BELIEVED_AFTER:
             self.restarts += 1
             self.reset()
         return None

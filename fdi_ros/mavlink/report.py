@@ -17,11 +17,11 @@ import math
 from collections.abc import Callable, Sequence
 
 from fdi_ros.mavlink.link import Link
-from fdi_ros.mavlink.protocol import ENOUGH, MESSAGES, MS, NS, RESOLUTION, numbers
-from fdi_ros.mavlink.vehicle import LOST, UnitTrack, Vehicle
+from fdi_ros.mavlink.protocol import ENOUGH, IMU_MESSAGES, MS, NS, RESOLUTION, numbers
+from fdi_ros.mavlink.vehicle import LOST_AFTER, UnitTrack, Vehicle
 from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine
 
-LOSSY = 0.05  #: Share of lost messages from which the link is a WARN.
+WARNED_LOSS = 0.05  #: Share of lost messages from which the link is a WARN.
 
 
 class Reporter:
@@ -77,7 +77,9 @@ class Reporter:
             )
         words = []
         if others := sorted(
-            system for system, at in vehicle.others.items() if now - at < 10 * LOST
+            system
+            for system, at in vehicle.others.items()
+            if now - at < 10 * LOST_AFTER
         ):
             words.append(
                 f"other autopilots on the link, left aside: {', '.join(map(str, others))}"
@@ -88,7 +90,7 @@ class Reporter:
             )
         lost = recent.get("lost", 0)
         heard = recent.get("in use", 0)
-        if lost > LOSSY * (lost + heard):
+        if lost > WARNED_LOSS * (lost + heard):
             words.append(f"{lost} of {lost + heard} messages lost")
         if more := [
             str(unit + 1) for unit in sorted(vehicle.units) if unit >= len(self._names)
@@ -140,7 +142,7 @@ class Reporter:
             (
                 number
                 for number in numbers(self._vehicle.kind)
-                if MESSAGES[number].unit in (unit, -1)
+                if IMU_MESSAGES[number].unit in (unit, -1)
             ),
             None,
         )
@@ -174,7 +176,7 @@ class Reporter:
         track = self._vehicle.units.get(unit, UnitTrack())
         return (
             ("topic", self._topics[unit]),
-            ("message", MESSAGES[number].name if number is not None else "none"),
+            ("message", IMU_MESSAGES[number].name if number is not None else "none"),
             ("rate (Hz)", f"{track.rate(now):.1f}"),
             ("asked for (Hz)", f"{self._vehicle.settings.rate:g}"),
             ("samples", str(track.received)),
@@ -184,13 +186,13 @@ class Reporter:
 
 
 CRITICAL, WARNING, INFO = 2, 4, 6  #: MAV_SEVERITY
-LENGTH = 50  #: Characters of a STATUSTEXT.
+TEXT_LENGTH = 50  #: Characters of a STATUSTEXT.
 EVERY = NS  #: Mean time between texts, ns.
 AT_ONCE = 5  #: Texts that may follow each other at once after a quiet time.
-SETTLE = NS // 5  #: Changes within this time share texts, ns.
-SILENT = 3 * NS  #: A monitor without reports for this time is silent, ns.
+SHARED_WITHIN = NS // 5  #: Changes within this time share texts, ns.
+MONITOR_SILENT = 3 * NS  #: A monitor without reports for this time is silent, ns.
 #: `NOTHING_SEEN` is announced after this time, ns: a late unit ends sooner.
-STANDING = 2 * NS
+NOTHING_SEEN_FOR = 2 * NS
 GRAVE = 0.03  #: ArduCopter flies with a smaller error of a gyro, rad/s.
 #: Raw rates of healthy gyros, in whole mrad/s and averaged, differ by less, rad/s.
 ROUNDED = 0.005
@@ -222,7 +224,7 @@ def _format_whole(line: StatusLine) -> str:
 
 def _fit(name: str, words: str) -> str:
     """Return a text about a unit or channel. A name that is too long loses its beginning."""
-    return f"FDI: {name[-(LENGTH - len(f'FDI:  {words}')) :]} {words}"
+    return f"FDI: {name[-(TEXT_LENGTH - len(f'FDI:  {words}')) :]} {words}"
 
 
 class Announcer:
@@ -277,7 +279,7 @@ class Announcer:
                 words = _format_whole(line)
                 is_none = words == NOTHING_SEEN
                 self._nothing_since = (self._nothing_since or now) if is_none else None
-                if now - (self._nothing_since or 0) >= STANDING:
+                if now - (self._nothing_since or 0) >= NOTHING_SEEN_FOR:
                     self._note(WHOLE, (words, ""), now)
             elif line.name in self._apart and (state in _STATES or state in _FINE):
                 self._apart[line.name] = line.value("apart (rad/s)").partition(" ")[0]
@@ -297,11 +299,11 @@ class Announcer:
 
     def due(self, now: int) -> list[tuple[int, str]]:
         """Return the texts to be sent now, ns, each with its severity."""
-        if self._heard and now - self._heard > SILENT:
+        if self._heard and now - self._heard > MONITOR_SILENT:
             self._note(WHOLE, ("the monitor is silent", ""), now)
         self._tokens = min(AT_ONCE, self._tokens + (now - self._filled) / EVERY)
         self._filled = now
-        if self._changed is not None and now - self._changed < SETTLE:
+        if self._changed is not None and now - self._changed < SHARED_WITHIN:
             return []
         self._changed = None
         alike = self._alike()
@@ -385,6 +387,6 @@ class Announcer:
         if len(names) == 2 and (size := self._apart.get(max(names))):
             texts.insert(0, f"FDI: {group.replace(', ', ' or ')} wrong by {size} rad/s")
         return next(
-            (text for text in texts if len(text) <= LENGTH),
+            (text for text in texts if len(text) <= TEXT_LENGTH),
             f"FDI: one faulty of {len(names)} channels",
         )

@@ -23,7 +23,7 @@ from fdi_ros.mavlink.link import Verifier, now_in_steps
 from fdi_ros.mavlink.protocol import (
     ARDUPILOT,
     DEFAULT_INTERVAL,
-    MESSAGES,
+    IMU_MESSAGES,
     MOST_UNITS,
     MS,
     NO_AUTOPILOT,
@@ -49,18 +49,18 @@ GROUND_STATION, ONBOARD_CONTROLLER = 6, 18  #: MAV_TYPE
 ACTIVE = 4  #: MAV_STATE
 ARMED = 128  #: MAV_MODE_FLAG
 REAL32 = 9  #: MAV_PARAM_TYPE. ArduPilot accepts any type.
-LOST = 3 * NS  #: An autopilot is lost after this time without a message, ns.
+LOST_AFTER = 3 * NS  #: An autopilot is lost after this time without a message, ns.
 UNSYNCHRONISED = 2 * NS  #: Without TIMESYNC for this time, arrival stamps samples, ns.
 CHOICE = 3 * NS  #: Kinds of messages are compared for this time before the choice, ns.
 OLDEST = 10 * NS  #: Older samples are refused, ns.
 NEWEST = NS  #: Samples further in the future are refused, ns.
 STAND_IN = 2 * NS  #: After this time without SCALED_IMU, RAW_IMU replaces it, ns.
-WINDOW = 2 * NS  #: Rates are measured over this time, ns.
+RATE_WINDOW = 2 * NS  #: Rates are measured over this time, ns.
 MOST_LATE = 8  #: After this number of late messages in a row the count begins anew.
 _PEERS = 8  # largest number of addresses with a parser
 # bytes after which a parser's buffer is cut: pymavlink cuts an empty one only
 _LEFT = 1 << 12
-LARGEST = 3.4e38  #: Largest float in a message.
+LARGEST_FLOAT = 3.4e38  #: Largest float in a message.
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,10 @@ class UnitTrack:
 
     def rate(self, now: int) -> float:
         """Return the present rate, Hz."""
-        while self.arrivals and self.arrivals[0] < now - WINDOW:
+        while self.arrivals and self.arrivals[0] < now - RATE_WINDOW:
             self.arrivals.popleft()
         count = len(self.arrivals)
-        if count < 2 or now - self.last > WINDOW // 2:
+        if count < 2 or now - self.last > RATE_WINDOW // 2:
             return 0.0
         return (count - 1) * NS / max(1, self.arrivals[-1] - self.arrivals[0])
 
@@ -213,9 +213,9 @@ class Vehicle:
             self.counts["unknown"] += 1
             if self._sequence is not None and sequence == (self._sequence + 1) & 255:
                 self._sequence = sequence
-        elif self._is_ours(message, number, system, component, peer, now):
+        elif self._is_from_autopilot(message, number, system, component, peer, now):
             is_new = self._count_lost(sequence)
-            if number in MESSAGES:
+            if number in IMU_MESSAGES:
                 return self._sample(number, data[header : header + data[1]], now)
             if number == TIMESYNC:
                 self.sync.answer(message.ts1, message.tc1, now)
@@ -248,7 +248,7 @@ class Vehicle:
             parser.buf_index = 0
         return list(messages)
 
-    def _is_ours(
+    def _is_from_autopilot(
         self,
         message: Any,
         number: int,
@@ -286,7 +286,7 @@ class Vehicle:
         if (
             peer != self.peer
             and self.heard
-            and now - self.heard <= LOST
+            and now - self.heard <= LOST_AFTER
             and self.peer is not None
         ):
             self.counts["from elsewhere"] += 1
@@ -310,9 +310,9 @@ class Vehicle:
         is_gone = self.system is None or self._lost
         if self.settings.system or not system or not (is_gone or not self.gives_gyros):
             return False
-        if number in MESSAGES:
-            return now - self.others.get(system, -LOST) < LOST
-        return beats and (is_gone or now - self._found > LOST)
+        if number in IMU_MESSAGES:
+            return now - self.others.get(system, -LOST_AFTER) < LOST_AFTER
+        return beats and (is_gone or now - self._found > LOST_AFTER)
 
     def _begin_with(self, message: Any, peer: Any, now: int) -> None:
         """Begin or resume a conversation with an autopilot."""
@@ -351,7 +351,7 @@ class Vehicle:
         return is_new
 
     def _sample(self, number: int, payload: bytes, now: int) -> ImuSample | None:
-        message = MESSAGES[number]
+        message = IMU_MESSAGES[number]
         # A unit that has delivered may die: its zeros are values.
         sample = read(number, payload, zeros=message.unit in self.units)
         if sample is None:
@@ -368,7 +368,7 @@ class Vehicle:
             self._scaled_at = now
         elif number == RAW and sample.unit == 0 and now - self._scaled_at > STAND_IN:
             # Unless RAW_IMU itself was chosen.
-            kind = kind if self.kind == kind else MESSAGES[SCALED].kind
+            kind = kind if self.kind == kind else IMU_MESSAGES[SCALED].kind
         if not self.kind and not self._choose(kind, sample.unit, now):
             return None
         return (
@@ -440,10 +440,10 @@ class Vehicle:
         if is_second := now - self._beat >= NS:
             self._beat = now
             self._say("heartbeat", ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE)
-        if self._found and not self._lost and now - self.heard > LOST:
+        if self._found and not self._lost and now - self.heard > LOST_AFTER:
             self._lost = True
             self.events.append(
-                f"nothing of {self.name}, system {self.system}, for {LOST // NS} s"
+                f"nothing of {self.name}, system {self.system}, for {LOST_AFTER // NS} s"
             )
         if not self.in_reach:
             return
@@ -460,7 +460,7 @@ class Vehicle:
     def _check_rates(self, now: int) -> None:
         """Request messages again that come too slowly; the slowest unit of a message counts."""
         for number in numbers(self.kind):
-            unit = MESSAGES[number].unit
+            unit = IMU_MESSAGES[number].unit
             if unit not in self.magnetometers:
                 brought = [unit] if unit >= 0 else list(self.units) or [0]
                 self.streams.check(
@@ -492,7 +492,7 @@ class Vehicle:
             "named_value_float",
             time,
             name.encode("ascii")[:10],
-            min(max(value, -LARGEST), LARGEST),
+            min(max(value, -LARGEST_FLOAT), LARGEST_FLOAT),
         )
 
     def _say(self, name: str, *fields: Any) -> None:

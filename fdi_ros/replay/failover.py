@@ -13,8 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.mavlink.failover import OVERSAMPLING, PARAMETERS
-from fdi_ros.mavlink.failover_evidence import DOUBTS, LARGE, SILENT, Evidence
+from fdi_ros.mavlink.failover import INS_USE, OVERSAMPLING
+from fdi_ros.mavlink.failover_evidence import (
+    DOUBTS,
+    LARGE_DIFFERENCE,
+    SILENCE,
+    Evidence,
+)
 from fdi_ros.mavlink.failover_policy import (
     PolicySettings,
     PolicyState,
@@ -108,7 +113,7 @@ class FailoverReplay(Sink):
         self._evidence.hear(sample.states, now)
         memories = self._state.memories
         out = [k for k, memory in enumerate(memories) if memory.ours]
-        delivers = [now - last < SILENT for last in self._delivered]
+        delivers = [now - last < SILENCE for last in self._delivered]
         imus = self._evidence.look(delivers, out, now)
         imus = tuple(
             imu._replace(use=use, heard=now)
@@ -141,13 +146,13 @@ class FailoverReplay(Sink):
 def is_possible(channels: Sequence[str]) -> bool:
     """Return whether failover works with these channels: three for each of 2 or 3 IMUs."""
     count, rest = divmod(len(channels), 3)
-    return 2 <= count <= len(PARAMETERS) and not rest
+    return 2 <= count <= len(INS_USE) and not rest
 
 
 def _is_far(rates: NDArray[np.float64]) -> NDArray[Any]:
-    """Return for each sample whether any two IMUs differ by `LARGE`; rates (N, 3 IMUs)."""
+    """Return for each sample whether any two IMUs differ by `LARGE_DIFFERENCE`; rates (N, 3 IMUs)."""
     units = rates.reshape(len(rates), -1, 3)
     low = np.nanmin(np.where(np.isnan(units), np.inf, units), axis=1)
     high = np.nanmax(np.where(np.isnan(units), -np.inf, units), axis=1)
-    far: NDArray[Any] = (high - low >= LARGE).any(axis=1)
+    far: NDArray[Any] = (high - low >= LARGE_DIFFERENCE).any(axis=1)
     return far

@@ -13,8 +13,8 @@ from fdi_ros.mavlink.report import (
     AT_ONCE,
     CRITICAL,
     INFO,
-    LENGTH,
     NOTHING_SEEN,
+    TEXT_LENGTH,
     WARNING,
     Announcer,
 )
@@ -83,7 +83,7 @@ def test_an_accelerometer_is_named_with_its_size_and_stays_a_warning(apart) -> N
     assert ground.hear(force(name, "OK")) == again
     unknown = [(WARNING, "FDI: accelerometer z of IMU 2 faulty")]
     assert ground.hear(force(name, "FAULTY")) == unknown
-    assert len("FDI: accelerometer z of IMU 4 off by 156.9 m/s^2") <= LENGTH
+    assert len("FDI: accelerometer z of IMU 4 off by 156.9 m/s^2") <= TEXT_LENGTH
 
 
 def test_declarations_are_told_and_suspicions_are_not() -> None:
@@ -226,7 +226,7 @@ def test_beside_failover_a_name_waits_while_the_raw_rates_contradict_it() -> Non
 def test_of_a_name_that_is_too_long_the_end_is_kept() -> None:
     channels = [f"the_imu_on_the_left_hand_side_of_the_nose.{axis}" for axis in "xyz"]
     ((_, text),) = Ground(channels).hear(report(channels[0], "FAULTY"))
-    assert len(text) == LENGTH
+    assert len(text) == TEXT_LENGTH
     assert text.endswith("_hand_side_of_the_nose.x faulty")
 
 
@@ -253,7 +253,9 @@ def test_however_it_flickers_the_link_is_spared_and_the_last_state_is_told(
         sum(at <= busy / NS for at, _, _ in ground.told)
         <= AT_ONCE + (busy / NS - 100) + 1
     )
-    assert all(len(text) <= LENGTH and text.isascii() for _, _, text in ground.told)
+    assert all(
+        len(text) <= TEXT_LENGTH and text.isascii() for _, _, text in ground.told
+    )
     for name, state in states.items():
         known = ground.announcer._said[name][0]
         assert known == (state if state in ("FAULTY", "AMBIGUOUS", "STALE") else "OK")

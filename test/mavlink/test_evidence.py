@@ -11,7 +11,7 @@ import pytest
 
 from fdi_ros.core.states import ChannelState
 from fdi_ros.mavlink.failover_evidence import (
-    FORGOTTEN,
+    STATES_KNOWN_FOR,
     Evidence,
     RawComparison,
 )
@@ -528,8 +528,8 @@ def test_a_monitor_that_died_names_nobody() -> None:
     watched.run(1.0)
     assert watched.step()[0].named is True
     watched.is_reporting = False
-    assert watched.run(0.8 * FORGOTTEN / NS).step()[0].named is True
-    found = watched.run(0.3 * FORGOTTEN / NS).step()
+    assert watched.run(0.8 * STATES_KNOWN_FOR / NS).step()[0].named is True
+    found = watched.run(0.3 * STATES_KNOWN_FOR / NS).step()
     assert [(imu.named, imu.ok) for imu in found] == [(None, False)] * 3
 
 

@@ -23,7 +23,7 @@ from fdi_ros.mavlink import failover_file
 from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
 from fdi_ros.mavlink.failover_file import FailoverFile
 from fdi_ros.mavlink.failover_policy import Condition, PolicySettings
-from fdi_ros.mavlink.failover_words import WORDS, imu_name, imu_text
+from fdi_ros.mavlink.failover_words import CONDITION_WORDS, imu_name, imu_text
 from fdi_ros.system.clocks import Clocks
 from mavlink.autopilots import (
     EKF_LANES,
@@ -954,8 +954,8 @@ def test_another_system_says_nothing_of_the_imu_that_is_out(tmp_path: Path) -> N
 
 
 def test_no_two_conditions_have_the_same_words_and_each_fits() -> None:
-    texts = [words.text for words in WORDS.values()]
-    assert set(WORDS) == set(Condition)
+    texts = [words.text for words in CONDITION_WORDS.values()]
+    assert set(CONDITION_WORDS) == set(Condition)
     assert len(set(texts)) == len(texts)
     assert max(len(f"FDI: IMU 1 {text}") for text in texts) <= 50
 

@@ -13,7 +13,13 @@ from collections.abc import Callable
 import pytest
 
 from fdi_ros.errors import FdiError
-from fdi_ros.mavlink.link import MOST_AT_ONCE, MOST_WAITING, RETRY, Link, open_link
+from fdi_ros.mavlink.link import (
+    MOST_AT_ONCE,
+    MOST_WAITING,
+    REOPEN_EVERY,
+    Link,
+    open_link,
+)
 from mavlink.autopilots import NS, free_port
 
 
@@ -26,7 +32,7 @@ class Clock:
     def read(self, until: Callable[[bytes], bool] = bool) -> bytes:
         data = b""
         for _ in range(500):
-            self.now += RETRY
+            self.now += REOPEN_EVERY
             data += b"".join(received for _, received in self.link.receive(self.now))
             if until(data):
                 break
@@ -115,9 +121,9 @@ def test_tcp_is_connected_again_when_it_is_lost() -> None:
                 assert clock.read(lambda data: len(data) == 3) == b"one"
                 link.send(b"two", None)
                 assert peer.recv(100) == b"two"
-            clock.now -= RETRY * 100  # No attempt is due.
+            clock.now -= REOPEN_EVERY * 100  # No attempt is due.
             assert until(lambda: link.receive(clock.now) == [] and link.trouble)
-            clock.now += RETRY * 101
+            clock.now += REOPEN_EVERY * 101
             assert "closed" in link.trouble
     link.close()
     nobody = open_link(f"tcp:127.0.0.1:{port}")

@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from fdi_ros.mavlink.failover_policy import (
+    CHANGE_STANDS,
+    FIRST_PAUSE,
     GROUNDED,
-    LASTING,
     LONGEST_PAUSE,
-    PAUSE,
     QUICK_TRIES,
     STALE_ANSWER,
     VEHICLE,
@@ -42,7 +42,7 @@ def tick(memory, now, *, use, agreed=None):
 
 @pytest.mark.parametrize("taken", [1, 2, 3, 9])
 def test_the_pause_before_an_imu_goes_back_doubles_each_time_it_was_taken_out(taken):
-    pause = min(PAUSE * 2 ** (taken - 1), LONGEST_PAUSE)
+    pause = min(FIRST_PAUSE * 2 ** (taken - 1), LONGEST_PAUSE)
     memory, agreed = replace(OUT, taken=taken), START + 1000 * MS
     assert tick(memory, agreed + pause - MS, use=False, agreed=agreed).held
     assert not tick(memory, agreed + pause, use=False, agreed=agreed).held
@@ -57,12 +57,14 @@ def reported(memory, first, last):
 
 def test_a_late_answer_to_a_read_is_nobodys_hand_and_a_later_one_is():
     """By then it says how the IMU is, and not how it was before our order."""
-    late = reported(OUT, START + 20 * MS, START + STALE_ANSWER + LASTING - 40 * MS)
+    late = reported(
+        OUT, START + 20 * MS, START + STALE_ANSWER + CHANGE_STANDS - 40 * MS
+    )
     assert late.ours
     assert not late.left_alone
     begin = START + STALE_ANSWER
-    assert not reported(OUT, begin, begin + LASTING - 20 * MS).left_alone
-    assert reported(OUT, begin, begin + LASTING + 40 * MS).left_alone
+    assert not reported(OUT, begin, begin + CHANGE_STANDS - 20 * MS).left_alone
+    assert reported(OUT, begin, begin + CHANGE_STANDS + 40 * MS).left_alone
 
 
 def on_the_ground(memory, now, *, named=False, use=False, boots=0, turned=True):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.mavlink.protocol import (
-    MESSAGES,
+    IMU_MESSAGES,
     MS,
     NS,
     BootClock,
@@ -54,7 +54,7 @@ def payload_of(message) -> bytes:
     return data[10 : 10 + data[1]]
 
 
-@pytest.mark.parametrize("number", MESSAGES)
+@pytest.mark.parametrize("number", IMU_MESSAGES)
 @given(
     time=st.integers(1, 2**32 - 1),
     values=st.lists(SHORT, min_size=6, max_size=6),
@@ -63,7 +63,7 @@ def payload_of(message) -> bytes:
 def test_values_are_pymavlinks_in_our_units_and_axes(
     number: int, time: int, values: list[int], unit: int
 ) -> None:
-    message, theirs = MESSAGES[number], mavlink.mavlink_map[number]
+    message, theirs = IMU_MESSAGES[number], mavlink.mavlink_map[number]
     assert (message.name, message.size) == (theirs.msgname, theirs.unpacker.size)
     acceleration, rate = values[:3], values[3:]
     if message.name == "HIGHRES_IMU":
