@@ -294,6 +294,13 @@ class NoiseConfig:
         0.0,
         1.0,
     )
+    g_sensitivity_std: float = setting(
+        1.8e-4,
+        "standard deviation of the change of a gyro's bias with the specific force, beside accelerometers; 0: none",
+        "(rad/s)/(m/s^2)",
+        0.0,
+        0.01,
+    )
     acceleration_window: float = setting(
         0.01,
         "span over which the angular acceleration is taken, at least one sample",

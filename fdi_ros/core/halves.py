@@ -54,6 +54,15 @@ def give_sample(core: Core, gyros: Core, sample: Sample, half: int) -> None:
 
 
 @compiled
+def give_force(core: Core, accelerometers: Core) -> None:
+    """Give the gyros the fused specific force of the sample before."""
+    last = accelerometers.last
+    core.sample.has_force = last.valid
+    for a in range(3):
+        core.sample.force[a] = accelerometers.settings.natural * last.rate[a]
+
+
+@compiled
 def follow_turn(turning: Turning, rate: Vector, stamp: int) -> None:
     """Follow the rotation of the body with the fused rate (3,) of a sample, rad/s."""
     since = (stamp - turning.stamp) * 1e-9

@@ -27,7 +27,7 @@ from fdi_ros.core.copies import update_copies
 from fdi_ros.core.decision import CHECKED, at_least, decide, forget_kind
 from fdi_ros.core.evidence import fill_suspects, gather_evidence
 from fdi_ros.core.fusion import fuse
-from fdi_ros.core.halves import give_sample
+from fdi_ros.core.halves import give_force, give_sample
 from fdi_ros.core.health import FINE, OUT_OF_RANGE, check, leave_flickering
 from fdi_ros.core.judging import (
     is_prepared,
@@ -149,6 +149,8 @@ def step_halves(
         core = path.core[0]
         if not core.now.waiting:
             give_sample(core, gyros, sample, gyros.half)
+            if halves > 1 and gyros.half == 0:
+                give_force(core, paths[1].core[0])
         after = step(path, core.given, row, events, count)
         if after < 0:
             return count, True

@@ -213,6 +213,9 @@ class SampleInput:
     spin: Vector
     # standard deviation of the positions, m over the natural size of the quantity
     position_std: Channels
+    # fused specific force of the sample before, m/s^2, beside gyros
+    force: Vector
+    has_force: Flag
     interrupted: Flag  # a hole in the stream precedes this sample
     # a manoeuvre has just driven a channel out of range: evidence is void
     in_recovery: Flag

@@ -236,7 +236,7 @@ def add_noise(
         inference.covariance[i, i] += (
             noise + kf.peak_extra[i] * part + nonlinear_error * nonlinear_error
         )
-        inference.covariance[i, i] += moved
+        inference.covariance[i, i] += moved + kf.force_variance
         place = params.layout.delays[params.unit[i]]
         if place >= 0:
             swing = moves * kf.peak_turn[i] * part

@@ -70,6 +70,7 @@ from fdi_ros.estimator.estimator import (
     update_weights,
     watch_for_motion,
 )
+from fdi_ros.estimator.g_sensitivity import follow_force, renew_reference
 from fdi_ros.estimator.noise import (
     MOTION,
     REST,
@@ -187,6 +188,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     update_shared_level(params, kf)
     predict(params.layout, kf.states, kf.seconds - kf.learned_at)
     kf.learned_at = kf.seconds
+    renew_reference(params, kf)
     if kf.blocks < FEWEST_BLOCKS:
         return
     kf.unseen = False
@@ -288,6 +290,7 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
         project(params.layout, kf.states, kf.at)
         update_weights(params, kf)
     follow_displacement(params, kf, sample)
+    follow_force(params, kf, sample)
     update_statistics(params, kf)
     find_outliers(params, kf, sample.z)
     if kf.judged == 0:
@@ -453,6 +456,9 @@ class Sequential(Detector):
         fault has to be beyond that, unless it is sudden.
     largest_move
         By which all healthy biases may move together within half a minute, rad/s.
+    g_sensitivity_std
+        Standard deviation of the change of a bias with the specific force, where the
+        samples have one, (rad/s)/(m/s^2).
     delay_std
         Standard deviation of the delay of one unit against another, s.
     gain_is_fault
@@ -481,6 +487,7 @@ class Sequential(Detector):
         bias_walk: float | Sequence[float] = 5e-5,
         bias_move: float = 0.0,
         largest_move: float = 0.04,
+        g_sensitivity_std: float = 0.0,
         delay_std: float = 0.001,
         gain_is_fault: bool = False,
         louder: float = math.inf,
@@ -504,6 +511,7 @@ class Sequential(Detector):
                 "bias_walk": float(walk.max()),
                 "bias_move": bias_move,
                 "largest_move": largest_move,
+                "g_sensitivity_std": g_sensitivity_std,
                 "delay_std": delay_std,
                 "gain_is_fault": gain_is_fault,
                 "louder": louder,
@@ -536,6 +544,7 @@ class Sequential(Detector):
         params["gain_is_fault"] = gain_is_fault
         params["louder"] = louder
         params["rest_std"] = REST_STD
+        params["g_sensitivity"] = g_sensitivity_std
         params["bias_move"] = bias_move
         params["largest_move"] = largest_move
         params["limit"] = self.run_length

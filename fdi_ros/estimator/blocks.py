@@ -152,7 +152,7 @@ def judge_block(params: Constants, kf: Estimator) -> float:
         for j in range(n):
             kf.matrix[i, j] = kf.block_at.covariance[i, j]
         kf.block_noise[i] = noise.now.block[i] * noise.longest[i] / params.length
-        kf.matrix[i, i] += kf.block_noise[i] + kf.extra[i]
+        kf.matrix[i, i] += kf.block_noise[i] + kf.extra[i] + kf.force_variance
     add_displacement_of_block(params, kf, kf.matrix)
     fill_joint_parity(kf.block_parity, params.sensors, mask, kf.matrix, UNKNOWN_RATE)
     subtract_errors(
@@ -322,7 +322,9 @@ def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
     for i in range(n):
         kf.displaced[i] *= PEAK
         kf.allowed[i] = kf.displaced[i]
-        kf.at.covariance[i, i] += kf.peak_extra[i] + kf.displaced[i]
+        lately = kf.peak_extra[i] + kf.displaced[i] + kf.force_variance
+        kf.at.covariance[i, i] += lately
+    kf.counted_variance = kf.force_variance
     kf.speed_squared = kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
     update_weights(params, kf)
 

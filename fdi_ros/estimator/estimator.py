@@ -114,6 +114,8 @@ class Constants:
     # standard deviation of errors not linear in the rate, share of the rate along each
     nonlinearity: Channels
     rest_std: Real  # of the rate at rest, rad/s
+    # of a bias, standard deviation, (rad/s)/(m/s^2); 0: none
+    g_sensitivity: Real
     bias_move: Real  # of a healthy bias in flight, standard deviation, rad/s
     largest_move: Real  # of all healthy biases together within half a minute, rad/s
     determines: Sets  # sets of channels that give a rate
@@ -255,6 +257,12 @@ class Estimator:
     turned: Matrix
     displacement: Axes
     allowed: Channels  # part of `displaced` that the covariance of samples contains
+    has_force: Flag  # a specific force has come
+    force: Vector  # smoothed specific force, m/s^2
+    reference_force: Vector  # specific force that the biases belong to, m/s^2
+    near_at: Real  # when the force was last near the reference, s since the start
+    force_variance: Real  # of a gyro by g-sensitivity, lately largest, (rad/s)^2
+    counted_variance: Real  # part of it that the covariance of samples contains
     rest_rates: Window  # of the last blocks, rad/s
     rest_noise: Vector  # variance of the rate of a block, (rad/s)^2
     rest_bias_variance: Vector  # variance of the rate by the biases, (rad/s)^2

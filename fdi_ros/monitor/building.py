@@ -157,6 +157,7 @@ def _build(
         "bias_walk": config.noise.bias_walk,
         "bias_move": quantity.bias_move * config.bias.turn_on_std,
         "largest_move": quantity.largest_move,
+        "g_sensitivity_std": config.noise.g_sensitivity_std,
         "delay_std": delay_std,
         "gain_is_fault": quantity.gain_is_fault,
         "louder": quantity.louder,
