@@ -123,8 +123,8 @@ _SETTINGS: Mapping[str, Options] = {
     "--output": takes_path("parameter file to write", required=True),
     **PART,
     "--reference": takes(
-        "trust the configured axes of this triad, or of three channels 'a,b,c';"
-        " default: all triads share the deviation equally",
+        "keep the configured axes of this unit, or of three channels 'a,b,c', and fit"
+        " the others to them; default: all units move equally",
         default="",
         metavar="NAME",
     ),

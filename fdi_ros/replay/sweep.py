@@ -202,8 +202,11 @@ class Baseline:
         return f"no sample of {samples} has values of enough channels"
 
 
-def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
-    """Judge a recording without faults. `BagError` if it has no sample."""
+def watch_baseline(pipeline: Pipeline, block: Block, start: float = 0.0) -> Baseline:
+    """Judge a recording without faults. `BagError` if it has no sample.
+
+    ``start``: time of the first sample, s; times in the judgement count from its origin.
+    """
     if not len(block):
         raise BagError(
             "its topics have no time in common: there is no sample of all channels"
@@ -218,9 +221,8 @@ def watch_baseline(pipeline: Pipeline, block: Block) -> Baseline:
         )
 
     kept = Kept(what_counts)
-    judge = Judge(
-        pipeline, Injector((), pipeline.channel_names, int(block.stamp[0])), [kept]
-    )
+    origin = int(block.stamp[0]) - round(start * 1e9)
+    judge = Judge(pipeline, Injector((), pipeline.channel_names, origin), [kept])
     judge.take(block)
     judged, doubtful, speed = kept.columns
     seconds = _seconds(block)
@@ -398,6 +400,8 @@ class Subject:
     """Units whose accelerometers are judged."""
     baseline: Baseline | None = None
     """Result without faults. None: the monitor does not run."""
+    start: float = 0.0
+    """Time of the first sample, s from the first message of the recording."""
     refused: str = ""
     """Why the monitor does not run or judges nothing. Empty: it does."""
     times: tuple[float, ...] = ()
@@ -497,7 +501,7 @@ def _watch(one: Subject) -> None:
         one.block = pipeline.arranged(one.block)
         one.felt = pipeline.felt
         one.channels = pipeline.channel_names
-        one.baseline = watch_baseline(pipeline, one.block)
+        one.baseline = watch_baseline(pipeline, one.block, one.start)
         one.refused = (
             ""
             if one.baseline.judged

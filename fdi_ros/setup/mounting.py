@@ -347,7 +347,7 @@ def summary_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
             unit.name,
             unit.factor,
         ),
-        *([f"names rest on {assumed}"] if assumed else []),
+        *([f"naming assumes {assumed}"] if assumed else []),
         *pair_lines(result),
     ]
 
@@ -427,7 +427,7 @@ def mounting_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
             _matrix("xyz", covariance, ".3e"),
         ),
         Section("Similar faults", RHO_TITLE, _matrix(names, rho, ".3f"), [drawn_rho]),
-        Section("After each possible first fault", _double_words(result), losses),
+        Section("After a loss", _double_words(result), losses),
     ]
 
 

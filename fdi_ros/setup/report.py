@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -91,6 +92,9 @@ FORCE_HINT = (
     "Differences from what all accelerometers have in common, which is not seen; with standard errors (+-). The axes"
     " of the gyros, of units at right angles, are nominal."
 )
+WARNINGS_HINT = (
+    "Those in the first line decide the verdict; look at the others when you can."
+)
 BIAS_HINT = "Estimate over the recording, minus the mean of each channel. The common part is observable only at rest."
 
 
@@ -119,7 +123,7 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     (least, most), (low, high) = (
         (std.min() * factor, std.max() * factor) for std in (floor.std, usual)
     )
-    words = f"noise_std {least:.2g} to {most:.2g} {name}, in the quietest {floor.share:.0%} of the recording;"
+    words = f"noise_std {least:.2g} to {most:.2g} {name}, {_quietest(floor.share)};"
     words += f" median with vibration {low:.2g} to {high:.2g}"
     largest = int(floor.std.argmax())
     yield Finding(
@@ -137,7 +141,10 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     bent = found.nonlinearity
     words = "nonlinearity not measured: turn faster, both ways about every axis"
     if bent.is_measured:
-        words = f"nonlinearity {100 * bent.value:.2g} +- {100 * bent.error:.1g} % of the largest rate"
+        size = f"{100 * bent.value:.2g} +- {100 * bent.error:.1g} %"
+        if abs(bent.value) < bent.error:
+            size = f"too small to measure, below {100 * bent.error:.1g} %"
+        words = f"nonlinearity {size} of the largest rate"
     yield Finding(Role.FOUND, "nonlinearity", words, (), bent.value, bent.error)
     for delay in result.delays:
         names = [result.names[i] for i in delay.channels]
@@ -153,11 +160,20 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
         )
 
 
+def _quietest(share: float) -> str:
+    """Return in which part of the recording the noise is the quietest."""
+    if share > 0.995:
+        return "over the whole recording"
+    return f"in the quietest {share:.0%} of the recording"
+
+
 def _position(axis: str, value: float, error: float) -> str:
     """Return a measured position in words, m: a value below its error is no number."""
     if abs(value) < error:
-        return f"{axis} 0 (standard error {error:.3f})"
-    return f"{axis} {value:.3f} +- {error:.3f}"
+        return f"{axis} 0 within {error:.1g}"
+    # As many digits as the first one of the error.
+    digits = max(3, math.ceil(-math.log10(error)))
+    return f"{axis} {value:.{digits}f} +- {error:.1g}"
 
 
 def _positions(result: Calibration) -> Iterator[Finding]:
@@ -274,8 +290,8 @@ def _found_forces(fit: AccelerometerFit) -> Iterator[Finding]:
     low = found.floor.std.min()
     high = found.floor.std.max()
     usual = np.median(found.moment, axis=0)
-    words = f"accelerometers: noise {low:.2g} to {high:.2g} {name}, in the quietest"
-    words += f" {found.floor.share:.0%} of the recording; median with vibration"
+    words = f"accelerometers: noise {low:.2g} to {high:.2g} {name},"
+    words += f" {_quietest(found.floor.share)}; median with vibration"
     words += f" {usual.min():.2g} to {usual.max():.2g}"
     largest = int(found.floor.std.argmax())
     noise = found.floor.std[largest]
@@ -294,8 +310,8 @@ def _found_forces(fit: AccelerometerFit) -> Iterator[Finding]:
             f", the largest {fit.names[largest]} {value:+.3f} +- {error:.3f} {name}"
         )
     yield Finding(Role.FOUND, "accelerometer bias", words)
-    words = f"accelerometers: scale error {fit.scale[0]:.2g} +- {fit.scale[1]:.1g}"
-    words += " left between them"
+    words = "accelerometers: after correction their scales still differ by"
+    words += f" {100 * fit.scale[0]:.2g} +- {100 * fit.scale[1]:.1g} %"
     yield Finding(Role.FOUND, "accelerometer scale error", words, (), *fit.scale)
 
 
@@ -349,10 +365,7 @@ def _force_warnings(fit: AccelerometerFit) -> Iterator[Finding]:
 
 def _declared(faults: Sequence[Span], names: Sequence[str]) -> Finding:
     """Return the finding for what the monitor declares in the part used for fitting."""
-    spans = [
-        f"{' or '.join(names[i] for i in who)} from {a:.1f} s to {b:.1f} s"
-        for who, a, b in faults
-    ]
+    spans = [_span_words(span, names) for span in faults]
     words = (
         f"the monitor declares a fault in this recording: {first_of(spans, 3, '; ')}"
     )
@@ -364,6 +377,16 @@ def _declared(faults: Sequence[Span], names: Sequence[str]) -> Finding:
         [names[i] for i in struck],
         headline="USABLE, BUT LOOK",
     )
+
+
+def _span_words(span: Span, names: Sequence[str]) -> str:
+    """Return which channels are declared, and when."""
+    who = " or ".join(names[i] for i in span.channels)
+    if len(span.channels) == len(names):
+        who = f"any of the {len(names)} channels"
+    if f"{span.start:.1f}" == f"{span.end:.1f}":
+        return f"{who} at {span.start:.1f} s"
+    return f"{who} from {span.start:.1f} s to {span.end:.1f} s"
 
 
 class _Bound(NamedTuple):
@@ -476,7 +499,10 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
         words = f"mounts: {known} of {len(found.mounts) - 1} measured relative to {found.config.imu_names[0]}"
         yield Finding(Role.FOUND, "mounts", words, value=known)
     if result is not None:
-        yield from calibration_findings(result, found.config.body_frame, unit)
+        for finding in calibration_findings(result, found.config.body_frame, unit):
+            # What other settings declare is no warning about those that are written.
+            if not found.kept or finding.what != "declared":
+                yield finding
     noise = (mounting.noise, mounting.false_alarm_probability, unit.name, unit.factor)
     yield Finding(
         Role.FOUND, "mounting", summary_line(g, *noise, agree=not found.disagree)
@@ -527,7 +553,12 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
             warning, "declared", words, list(tried.declared), headline="DO NOT USE"
         )
     elif found.kept:
-        words = f"in {proof.source} {found.kept}; the previous settings are written"
+        written = "the file has the settings that were given"
+        if found.chosen:
+            written = (
+                "the file has the mounts found, and all else as `fdi inspect` does"
+            )
+        words = f"in {proof.source} {found.kept}. So {written}; what is measured below is not used"
         yield Finding(warning, "proof", words, headline="NO BETTER THAN BEFORE")
     else:
         yield _usable(found, tried, unit)
@@ -834,7 +865,7 @@ def setup_figures(found: SetupResult, bag: str) -> dict[str, object]:
 def _proof_section(found: SetupResult, hint: str, unit: Unit) -> Section:
     """Lay out the proof; a recording whose channels contradict each other proves nothing."""
     if found.disagree:
-        return Section("Proof", "Not done: the channels contradict each other.")
+        return Section("Proof", "", ["not done: the channels contradict each other"])
     return Section("Proof", hint, told(_tried(found, unit)))
 
 
@@ -849,18 +880,20 @@ def _sections(
     hint += f" Isolated: within {WITHIN:g} s."
     bag = shlex.quote(bag)
     config = shlex.quote(config)
+    is_bad = first.severity is Severity.BAD
+    first_step = "the verdict on this recording"
+    if is_bad:
+        first_step = "shows the trouble; do not fly with this config"
     steps = [
-        f"fdi replay {bag} --config {config} --report replay.html   # the verdict on this recording",
+        f"fdi replay {bag} --config {config} --report replay.html   # {first_step}",
         f"fdi sweep {bag} --config {config} --report sweep.html     # which faults the monitor would find in it",
         f"fdi calibrate ANOTHER_BAG --config {config} --output better.yaml   # with rest, and turns about every axis",
         f"fdi_node --ros-args --params-file {config}   # on the vehicle; in a workspace: ros2 run fdi_ros fdi_node ...",
     ]
-    steps = [
-        shown(line, LINE)
-        for line in (steps[:1] if first.severity is Severity.BAD else steps)
-    ]
+    steps = [shown(line, LINE) for line in (steps[:1] if is_bad else steps)]
+    warnings = lines_of(findings, Role.WARNING)
     sections = [
-        Section("Warnings", "", lines_of(findings, Role.WARNING)),
+        Section("Warnings", WARNINGS_HINT if warnings else "", warnings),
         Section("Not shown by this recording", "", lines_of(findings, Role.UNKNOWN)),
         _proof_section(found, hint, unit),
         Section("What to do next", "", steps),

@@ -147,14 +147,17 @@ class Proof:
         return ""
 
 
-def _tried(block: Block, config: Config) -> Tried:
-    """Replay a recording without and with test biases."""
+def _tried(block: Block, config: Config, start: float) -> Tried:
+    """Replay a recording without and with test biases.
+
+    ``start``: time of the block, s from the first message.
+    """
     faults = [f"kind=bias size={size:g}" for size in SIZES]
     faults += [f"channel={FORCES} kind=bias size={size:g}" for size in FORCE_SIZES]
     plan = Plan(
         tuple(one for text in faults for one in parse_swept(text)), TIMES, WITHIN
     )
-    one = Subject("settings", config, block)
+    one = Subject("settings", config, block, start=start)
     try:
         sweep([one], plan)
     except FdiError as error:
@@ -398,7 +401,7 @@ def _proved(
         raise found.why
     # Reading takes the delays off.
     tried = [
-        _tried(read_block(bag, one.config, start, end), one.config)
+        _tried(read_block(bag, one.config, start, end), one.config, start)
         for one in (before, found)
     ]
     lasts = max(

@@ -116,7 +116,7 @@ def test_what_names_rest_on_is_said():
         "imus.mounts": [*np.tile(np.eye(3).ravel(), 3)],
     }
     text = mounting_text(assess(Config.from_parameters(config)))
-    assert "names rest on no two failing alike of a.x/b.x/c.x, a.y/" in text
+    assert "naming assumes no two failing alike of a.x/b.x/c.x, a.y/" in text
     # Two that fail as the third would look give its parity: so it is for every set that is listed, and no other.
     for geometry in (
         three,

@@ -377,7 +377,7 @@ def test_what_cannot_be_found_is_said_and_the_config_loads(fdi, tmp_path, shown)
     assert ("on the vehicle" in out) == (code != 3)
     assert ("own.yaml (NOT FOR FLIGHT)\n" in out) == (code == 3)
     contradicts = shown == "factor"
-    assert ("Not done: the channels contradict each other." in out) == contradicts
+    assert ("not done: the channels contradict each other" in out) == contradicts
     page = (tmp_path / "own.html").read_text()
     for words in UNSHOWN[shown]:
         assert words in out
