@@ -44,6 +44,7 @@ from fdi_ros.estimator.blocks import (
     predict_innovation_covariance,
     update_angular_acceleration,
     update_excess,
+    update_incoherent,
 )
 from fdi_ros.estimator.delays import transfer_delays, update_time_offsets
 from fdi_ros.estimator.displacement import close_turn, follow_displacement
@@ -194,6 +195,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     kf.unseen = False
     update_angular_acceleration(params, kf)
     weight = judge_block(params, kf)
+    update_incoherent(params, kf)
     if kf.judged:
         update_from_block(params, kf, state.scales, learns)
         keep_information(params, state)

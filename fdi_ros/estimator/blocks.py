@@ -176,6 +176,36 @@ def judge_block(params: Constants, kf: Estimator) -> float:
 
 
 @compiled
+def update_incoherent(params: Constants, kf: Estimator) -> None:
+    """Update how much each channel deviates from the others beside what a delay explains.
+
+    The deviation of a late channel is proportional to its angular acceleration. Noise and
+    vibration that units do not share deviate and pass for angular acceleration alike,
+    and the learned noise may be far too small for them.
+    """
+    share = 1.0 / REST_BLOCKS
+    for i in range(params.sensors.n):
+        own = kf.block_information[i, i]
+        if not kf.masks[1] >> i & 1 or not own > 0.0:
+            continue
+        turn = kf.angular_acceleration[i]
+        begins = kf.deviation_square[i] == 0.0
+        slope = kf.deviation_turn[i] / max(kf.turn_square[i], 1e-12)
+        value = kf.block_values[i] / own
+        kf.deviation[i] += share * (value - kf.deviation[i])
+        value -= kf.deviation[i]
+        kf.deviation_square[i] += share * (value * value - kf.deviation_square[i])
+        kf.deviation_turn[i] += share * (value * turn - kf.deviation_turn[i])
+        kf.turn_square[i] += share * (turn * turn - kf.turn_square[i])
+        # A delay that was not known yet must not pass for noise.
+        rest = 0.0 if begins else value - slope * turn
+        slope = kf.deviation_turn[i] / max(kf.turn_square[i], 1e-12)
+        lately = kf.deviation_square[i] - slope * kf.deviation_turn[i]
+        # The other channels have at least half of it.
+        kf.incoherent[i] = 0.5 * max(lately, rest * rest)
+
+
+@compiled
 def unlearnable(error: float, inside: float, square: float) -> float:
     """Return the variance of a scale error that no number of samples removes.
 
@@ -240,6 +270,10 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
             * noise.longest[i]
             * math.sqrt(noise.unknown[i])
             / params.length
+        )
+        error = max(error, kf.incoherent[i])
+        largest_vibration = max(
+            largest_vibration, kf.incoherent[i] / (UNEQUAL * UNEQUAL)
         )
         turn = kf.angular_acceleration[i] * kf.angular_acceleration[i]
         least = unlearnable(error, 0.5 * largest_vibration / (kf.span * kf.span), turn)

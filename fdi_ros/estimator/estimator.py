@@ -237,6 +237,15 @@ class Estimator:
     block_innovation: Channels  # rad/s
     block_values: Channels  # A y, s/rad
     angular_acceleration: Channels  # along each channel, rad/s^2; zero where only noise
+    # Of the last second of blocks of each channel, against the others: mean deviation,
+    # rad/s; its mean square about that mean, (rad/s)^2; its mean product with the angular
+    # acceleration, rad^2/s^3; and the mean square of that acceleration, (rad/s^2)^2.
+    deviation: Channels
+    deviation_square: Channels
+    deviation_turn: Channels
+    turn_square: Channels
+    # variance of that deviation, halved, beside what a delay explains, (rad/s)^2
+    incoherent: Channels
     turning: Flag  # the angular acceleration exceeds noise
     shaken: Real  # square of the acceleration that blocks are too slow for, (rad/s^2)^2
     turn_noise: Real  # its variance, (rad/s^2)^2
@@ -587,3 +596,5 @@ def forget_motion(kf: Estimator, n: int) -> None:
     kf.unseen = kf.samples > 0
     for i in range(n):
         kf.angular_acceleration[i] = kf.extra[i] = 0.0
+        kf.deviation[i] = kf.deviation_square[i] = 0.0
+        kf.deviation_turn[i] = kf.turn_square[i] = 0.0

@@ -281,6 +281,54 @@ def test_holes_in_the_stream_teach_no_wrong_delay(hole, late):
     assert status.delay_std[1] < 0.002
 
 
+def own_noise(seconds, rng):
+    """Noise of 0.3 rad/s in every channel."""
+    return 0.3 * rng.standard_normal((len(seconds), 6))
+
+
+def own_vibration(seconds, rng):
+    """Units oscillate by 0.1 rad/s at the same three frequencies, each in its own way."""
+    total = np.zeros((len(seconds), 6))
+    for hertz in rng.uniform(2.0, 12.0, 3):
+        phase = np.repeat(rng.uniform(0.0, 2 * np.pi, 2), 3)
+        size = 0.1 * rng.standard_normal(6)
+        total += size * np.sin(2 * np.pi * hertz * seconds[:, None] + phase)
+    return total
+
+
+@pytest.mark.parametrize("shown", [own_noise, own_vibration])
+def test_noise_and_vibration_that_units_do_not_share_teach_no_delay(shown):
+    """Two units at rest, from 20 s on with much more than the settings expect."""
+    seconds = np.arange(0.0, 60.0, 1.0 / RATE)
+    pipeline = Pipeline.from_config(parallel(2, detector__name="sequential"))
+    for seed in range(8):
+        rng = np.random.default_rng([seed, 11])
+        z = SIGMA * white(seed, len(seconds))
+        z += (seconds > 20.0)[:, None] * shown(seconds, rng)
+        pipeline.restart()
+        pipeline.process(stamped(seconds, z))
+        status = pipeline.status()
+        assert abs(status.delays[1]) < 3.0 * status.delay_std[1]
+
+
+@pytest.mark.parametrize("late", [0.0, 0.005, 0.02])
+def test_a_delay_is_learned_in_slow_motion(late):
+    """At 0.3 rad/s, with periods of 5 s and more, well within a minute."""
+    seconds = np.arange(0.0, 60.0, 1.0 / RATE)
+
+    def rate(t):
+        turn = np.sin(np.outer(t, [0.6, 0.9, 1.2]))
+        return 0.3 * np.clip(t - 6.0, 0.0, 1.0)[:, None] * turn
+
+    z = np.hstack([rate(seconds), rate(seconds - late)])
+    z += SIGMA * white(5, len(seconds))
+    pipeline = Pipeline.from_config(parallel(2, detector__name="sequential"))
+    pipeline.process(stamped(seconds, z))
+    status = pipeline.status()
+    assert abs(status.delays[1] - late) < 3.0 * status.delay_std[1]
+    assert status.delay_std[1] < 0.006
+
+
 def flown_with_a_hole(units, hole, fault, seed):
     """Parallel units in motion, no samples from 12 s on for so many s, in which imu_2.y comes to be off."""
     rng, seconds = (
