@@ -15,7 +15,8 @@ the same folder replaces names that are not clear. All its entries are optional:
     acceleration_unit: g            # m/s^2 or g
     accelerations: [[ax1, ay1, az1], [ax2, ay2, az2]]
 
-Axes are not turned. An IMU without a value in a line has no message there. Times are
+An IMU keeps the number in its names: ``gyro_1_x`` is on ``/imu_1``. Without numbers, IMUs
+are counted from 0. Axes are not turned. An IMU without a value in a line has no message there. Times are
 doubles, so dates are exact to 0.3 us. Files are read in portions of bounded memory.
 """
 
@@ -25,6 +26,7 @@ import contextlib
 import csv
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Protocol
@@ -44,12 +46,14 @@ from fdi_ros.system.files import (
     NAME,
     open_regular,
 )
-from fdi_ros.system.text import shown
+from fdi_ros.system.text import own_numbers, shown
 from fdi_ros.system.yaml_file import read_yaml
 
 COLUMNS = "columns.yaml"
 GUIDE = 'docs/flight_logs.md, "Tables of text"'
 KIND = "columns"
+#: IMUs have up to three digits
+MOST_IMUS = 1000
 #: bytes that are read at once
 _READ_BYTES = 1 << 21
 _TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
@@ -108,6 +112,8 @@ class Columns(NamedTuple):
     time: int
     #: seconds of one unit of time, 0 if the first time decides
     tick: float
+    #: number of each IMU
+    numbers: tuple[int, ...]
     #: indices of the rates about x, y and z of each
     imus: tuple[tuple[int, int, int], ...]
     #: rates of each IMU are multiplied by this for rad/s
@@ -129,8 +135,8 @@ class CsvLog(FlightLog):
     )
     one_imu = "one IMU cannot be checked: this table has no other ({})"
     slowest = 5.0
-    #: number of the first IMU
-    first = 0
+    #: number of its only IMU, None for the numbers in the names of the columns
+    number: int | None = None
 
     def find_context(self) -> FlightContext:
         """Return nothing: a table has rates and accelerations only."""
@@ -138,13 +144,15 @@ class CsvLog(FlightLog):
 
     def _note_columns(self, line: str, names: str = "", why: str = "") -> None:
         """Note how columns were chosen, and those of a gyro that are left out."""
-        self.note(line)
         if names:
+            self.note(line)
             self.leave_out(names, why)
+        else:
+            self.state(line)
 
     def portions(self) -> Iterator[Portion]:
         """Read the table from its start up to `end`."""
-        delimiter, columns = find_columns(self.file, self._note_columns, self.first)
+        delimiter, columns = find_columns(self.file, self._note_columns, self.number)
         offset = self.file.tell()
         bad = 0
         rest = b""
@@ -186,7 +194,7 @@ class CsvLog(FlightLog):
                         1.0,
                     )
                     columns = columns._replace(tick=tick)
-                samples = _samples(table[good], ends[used][good], columns, self.first)
+                samples = _samples(table[good], ends[used][good], columns)
             self.counts["lines"] += len(used)
             offset = offset + size
             rest = b"" if final else data[size:]
@@ -203,7 +211,7 @@ class CsvUnit(CsvLog):
     fewest_imus = 1
 
     def __init__(self, path: Path, damage: Damage, most: int, number: int) -> None:
-        self.first = number
+        self.number = number
         super().__init__(path, damage, most)
         if len(self.topics) > 1:
             self.close()
@@ -220,11 +228,13 @@ def unit_numbers(paths: Sequence[Path]) -> list[int]:
     return numbers if len(set(numbers)) == len(paths) else list(range(len(paths)))
 
 
-def find_columns(file: BinaryIO, note: Note, first: int = 0) -> tuple[str, Columns]:
+def find_columns(
+    file: BinaryIO, note: Note, number: int | None = None
+) -> tuple[str, Columns]:
     """Return the delimiter and the columns to read, and move the file behind the names.
 
-    ``first``: number of the first IMU. `BagError` if no line holds names, or no name is
-    of a gyro.
+    ``number``: of the first IMU, None for the numbers in the names. `BagError` if no
+    line holds names, or no name is of a gyro.
     """
     file.seek(0)
     for _ in range(64):
@@ -252,7 +262,7 @@ def find_columns(file: BinaryIO, note: Note, first: int = 0) -> tuple[str, Colum
             f"{file.name} has no names of columns: its first line holds numbers. Put a line of names before"
             f" it, such as time,gyro1_x,gyro1_y,gyro1_z,gyro2_x,...: {GUIDE}"
         )
-    return delimiter, _columns(file, names, note, first)
+    return delimiter, _columns(file, names, note, number)
 
 
 class _Choice(NamedTuple):
@@ -276,22 +286,29 @@ class _Choice(NamedTuple):
         ]
 
 
-def _columns(file: BinaryIO, names: Sequence[str], note: Note, first: int) -> Columns:
+def _columns(
+    file: BinaryIO, names: Sequence[str], note: Note, number: int | None
+) -> Columns:
     """Choose the columns and note the choice.
 
     `BagError` if no gyro is found, or ``columns.yaml`` names other columns.
     """
     choice = _chosen_names(file, names, note)
     time_unit = str(choice.given.get("time_unit", _split(choice.time)[1]))
+    first = number or 0
+    numbers = own_numbers([_of_imu(x) for x, _, _ in choice.imus])
+    if number is not None or max(numbers, default=MOST_IMUS) >= MOST_IMUS:
+        numbers = list(range(first, first + len(choice.imus)))
     columns = Columns(
         names.index(choice.time),
         _factor(time_unit, _TIME_UNITS, 0.0, choice.time),
+        tuple(numbers),
         _places(names, choice.imus),
         tuple(choice.factors("rate_unit", choice.imus, _RATE_UNITS)),
         _places(names, choice.forces),
         tuple(choice.factors("acceleration_unit", choice.forces, _FORCE_UNITS)),
     )
-    _note_choice(choice, columns, note, first)
+    _note_choice(choice, columns, note)
     return columns
 
 
@@ -317,11 +334,16 @@ def _chosen_names(file: BinaryIO, names: Sequence[str], note: Note) -> _Choice:
     by_name = (name for name in names if _TIME_NAME.fullmatch(_split(name)[0]))
     time: Any = given.get("time", next(by_name, None))
     listed = shown(", ".join(names), MOST_SHOWN)
+    count = Counter(names)
     for name in (time, *(column for triad in (*imus, *forces) for column in triad)):
         if name not in names:
             missing = "no column of times" if name is None else f"no column {name!r}"
             raise BagError(
                 f"{file.name} has {missing}, it has {listed}; {COLUMNS} says which: {GUIDE}"
+            )
+        if count[name] > 1:
+            raise BagError(
+                f"{file.name} has {count[name]} columns {name!r}: give each a name of its own"
             )
     if not imus:
         raise BagError(
@@ -337,11 +359,12 @@ def _places(
     return tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in triads)
 
 
-def _note_choice(choice: _Choice, columns: Columns, note: Note, first: int) -> None:
+def _note_choice(choice: _Choice, columns: Columns, note: Note) -> None:
     """Note which columns are read, and in which units."""
     source = COLUMNS if "imus" in choice.given else "their names"
     imus = "; ".join(
-        f"/imu_{k} = {', '.join(imu)}" for k, imu in enumerate(choice.imus, first)
+        f"/imu_{number} = {', '.join(imu)}"
+        for number, imu in zip(columns.numbers, choice.imus, strict=True)
     )
     unit = ""
     if _DEGREES in columns.factors:
@@ -395,24 +418,66 @@ def _factor(unit: str, known: dict[str, float], default: float, name: str) -> fl
     return known.get(unit, default)
 
 
+class _Place(NamedTuple):
+    """What the name of a column says of a vector."""
+
+    #: name without its axis and its number
+    head: str
+    #: number behind the axis, may be empty
+    number: str
+    axis: str
+
+
+def _place_of(name: str) -> _Place | None:
+    """Return the place of a column in a vector, None if its name has no axis."""
+    plain = _split(name)[0]
+    match = _AXIS.search(plain)
+    if match is None or _TIME_NAME.fullmatch(plain):
+        return None
+    axis = match[1] or "xyz"[int(match[2])]
+    return _Place(plain[: match.start()].rstrip("._ "), match[3], axis)
+
+
+def _of_imu(name: str) -> str:
+    """Return the name of a column without its axis."""
+    place = _place_of(name)
+    return name if place is None else f"{place.head}_{place.number}".rstrip("_")
+
+
 def _triads(names: Sequence[str]) -> dict[tuple[str, str], dict[str, str]]:
     """Return the columns of each vector by axis, keyed by the name without its axis and its number."""
     groups: dict[tuple[str, str], dict[str, str]] = {}
     for name in names:
-        plain = _split(name)[0]
-        match = _AXIS.search(plain)
-        if match and not _TIME_NAME.fullmatch(plain):
-            axis = match[1] or "xyz"[int(match[2])]
-            head = plain[: match.start()].rstrip("._ ")
-            groups.setdefault((head, match[3]), {}).setdefault(axis, name)
+        if place := _place_of(name):
+            axes = groups.setdefault((place.head, place.number), {})
+            axes.setdefault(place.axis, name)
     return groups
+
+
+def _repeated(names: Sequence[str]) -> list[str]:
+    """Return the columns of gyros whose place in a vector a column before has, in another unit."""
+    taken = set()
+    found = []
+    for name in names:
+        place = _place_of(name)
+        if place and _is_gyro(place.head):
+            if place in taken:
+                found.append(name)
+            taken.add(place)
+    return found
 
 
 def _imus(names: Sequence[str], note: Note) -> list[list[str]]:
     """Return the columns x, y, z of each gyro, by names of gyros, or else by any names.
 
-    A gyro that lacks an axis is noted and left out.
+    A gyro that lacks an axis is noted and left out, and so is one that is there before
+    in another unit.
     """
+    if repeated := _repeated(names):
+        found = ", ".join(repeated)
+        verb = "is" if len(repeated) == 1 else "are"
+        why = "a column before has the same name but for its unit"
+        note(f"{found} {verb} left out: {why}", f"the gyro of {found}", why)
     groups = _triads(names)
     whole = {
         key: [axes[axis] for axis in "xyz"]
@@ -495,7 +560,7 @@ def _number(cells: Sequence[str], column: int) -> float:
 
 
 def _samples(
-    table: Array, end: Int, columns: Columns, first: int
+    table: Array, end: Int, columns: Columns
 ) -> list[tuple[Source, ImuSamples]]:
     """Return the samples of each IMU in lines, as of `_numbers`, that end at bytes (k,)."""
     # Impossible dates are left out later.
@@ -512,5 +577,5 @@ def _samples(
             force = table[:, behind + at : behind + at + 3] * columns.force_factors[k]
         measured = ~np.isnan(rate).all(axis=1)
         samples = imu_samples(stamp, rate, force, end)
-        found.append((Source(KIND, first + k), samples[measured]))
+        found.append((Source(KIND, columns.numbers[k]), samples[measured]))
     return found

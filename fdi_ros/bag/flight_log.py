@@ -250,7 +250,7 @@ class FlightLog(BagFile):
             raise
         dated = EARLIEST // 1000 <= self._starts[0] < NO_HORIZON
         if self.status:
-            self.note(self.status)
+            self.state(self.status)
         self._shift = (
             0 if dated else self.start_utc or 0
         )  # added to stamps, us; 0 for stamps that are dates, or without a date

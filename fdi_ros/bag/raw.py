@@ -125,8 +125,10 @@ def unpack_message(data: bytes, most: int) -> bytes:
 
 @dataclass
 class Damage:
-    """Unreadable parts of a recording, one line per place."""
+    """Unreadable parts of a recording, one line per place, and facts beside them."""
 
+    #: what readers must know, and is no damage
+    facts: list[str] = field(default_factory=list)
     lines: list[str] = field(default_factory=list)
     more: int = 0
 
@@ -149,9 +151,19 @@ class Damage:
     def __bool__(self) -> bool:
         return bool(self.lines)
 
-    def report(self) -> tuple[str, ...]:
+    def state(self, fact: str) -> None:
+        """Note a fact, escaped for display, once."""
+        line = shown(fact, MOST_SHOWN)
+        if line not in self.facts and len(self.facts) < self.MOST:
+            self.facts.append(line)
+
+    def losses(self) -> tuple[str, ...]:
         """Return the lines, and the number of dropped ones."""
         return (*self.lines, *([f"{self.more} more places"] if self.more else []))
+
+    def report(self) -> tuple[str, ...]:
+        """Return the facts, the lines, and the number of dropped ones."""
+        return (*self.facts, *self.losses())
 
 
 class LogText(NamedTuple):
@@ -213,8 +225,12 @@ class BagFile(ABC):
         """Read the messages of the topics."""
 
     def note(self, line: str) -> None:
-        """Note damage, or a fact that readers must know."""
+        """Note damage."""
         self._damage.add(f"{self.path.name}: {line}")
+
+    def state(self, fact: str) -> None:
+        """Note a fact that readers must know."""
+        self._damage.state(f"{self.path.name}: {fact}")
 
     def leave_out(self, names: str, why: str) -> None:
         """Note gyros that cannot be read as such."""

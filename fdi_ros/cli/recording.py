@@ -8,7 +8,7 @@ from __future__ import annotations
 import shlex
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,9 +16,13 @@ from fdi_ros.bag.reader import Recording, convert
 from fdi_ros.cli.outputs import Kind, Outputs, check_part, progress
 from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.errors import ConfigError
-from fdi_ros.inspection.findings import findings_figures, verdict_of
-from fdi_ros.inspection.fitness import candidates, needs, recording_findings
-from fdi_ros.inspection.starting_config import StartingConfig, starting_config
+from fdi_ros.inspection.findings import Finding, Role, findings_figures, verdict_of
+from fdi_ros.inspection.fitness import candidates, needs, one_clock, recording_findings
+from fdi_ros.inspection.starting_config import (
+    StartingConfig,
+    starting_config,
+    turned_units,
+)
 from fdi_ros.inspection.topics import (
     TopicReport,
     inspect,
@@ -42,10 +46,11 @@ def run_inspect(arguments: Namespace) -> int:
     outputs = Outputs(arguments, ("json", "output"), inputs)
     unit = unit_of(arguments.degrees)
     urdf = None if arguments.urdf is None else Urdf(arguments.urdf)
-    reports, damage = inspect(arguments.bag)
+    reports, damage, unread = inspect(arguments.bag)
     start, refused = _starting_config(reports, arguments.bag, urdf)
     config = None if start is None else start.text
-    found = verdict_of(recording_findings(reports, refused, unit))
+    looks = [*_mount_findings(start, arguments.bag, reports)]
+    found = verdict_of([*recording_findings(reports, refused, unit, unread), *looks])
     text = f"{found.words}\n{recording_text(reports, arguments.bag)}"
     text += topics_text(reports, damage, unit)
     if start is not None and start.mounted:
@@ -59,7 +64,9 @@ def run_inspect(arguments: Namespace) -> int:
         )
     figures = recording_figures(reports, arguments.bag, damage)
     figures |= {
-        **findings_figures(list(recording_findings(reports, refused))),
+        **findings_figures(
+            [*recording_findings(reports, refused, unread=unread), *looks]
+        ),
         "config": config,
     }
     if config is None:
@@ -74,6 +81,19 @@ def run_inspect(arguments: Namespace) -> int:
             f"{arguments.output} is not written: {shown(arguments.bag.name)} {found.words}"
         )
     return code
+
+
+def _mount_findings(
+    start: StartingConfig | None, bag: Path, reports: Sequence[TopicReport]
+) -> Iterator[Finding]:
+    """Yield a finding if the config of a fit recording has parallel units that are not."""
+    if start is None or start.mounted or one_clock(candidates(reports)):
+        return
+    if turned := turned_units(bag, Config.from_parameters(start.parameters)):
+        words = (
+            f"{turned}; the config has them parallel, `fdi setup` measures the mounts"
+        )
+        yield Finding(Role.WARNING, "mounts", words, headline="READY, BUT LOOK")
 
 
 def _starting_config(

@@ -8,39 +8,26 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-_NUMBER = re.compile(r"([A-Za-z]*)_?([0-9]+)")
+from fdi_ros.system.text import own_numbers
+
 _NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9]+")
-LONGEST_NUMBER = 9
-"""Digits of a number that may name a unit; longer ones are serial numbers."""
+_BARE = ("", "imu", "imus")
+"""Words before the number of an IMU that say no more than ``imu``."""
 
 
 def unit_names(topics: Sequence[str]) -> list[str]:
     """Name each unit after its topic.
 
-    Topics that have a number each behind the same word, and no number twice, give
+    Topics with numbers behind ``imu``, or behind no word, and no number twice, give
     ``imu_<number>``: ``/imu_0/data`` and ``/imu_1/data`` give ``imu_0`` and ``imu_1``. Other
     topics are named by the parts in which they differ: ``/front/imu`` and ``/rear/imu`` give
-    ``front`` and ``rear``, ``/bno055`` and ``/icm42688`` keep their names. If these are not
-    unique, units are numbered from 0 in the order of the topics.
+    ``front`` and ``rear``, ``/robot1/imu`` and ``/robot2/imu`` give ``robot1`` and
+    ``robot2``, ``/bno055`` and ``/icm42688`` keep their names. If these are not unique,
+    units are numbered from 0 in the order of the topics.
     """
-    return (
-        _by_number(topics)
-        or _by_difference(topics)
-        or [f"imu_{k}" for k in range(len(topics))]
-    )
-
-
-def _by_number(topics: Sequence[str]) -> list[str]:
-    """Return names by the first number that differs between all topics; empty if none does."""
-    found = [_NUMBER.findall(topic) for topic in topics]
-    for numbered in zip(*found, strict=False):
-        words = {word.lower() for word, _ in numbered}
-        numbers = [
-            int(digits) for _, digits in numbered if len(digits) <= LONGEST_NUMBER
-        ]
-        if len(words) == 1 and len(set(numbers)) == len(topics):
-            return [f"imu_{number}" for number in numbers]
-    return []
+    if numbers := own_numbers(topics, _BARE):
+        return [f"imu_{number}" for number in numbers]
+    return _by_difference(topics) or [f"imu_{k}" for k in range(len(topics))]
 
 
 def _by_difference(topics: Sequence[str]) -> list[str]:

@@ -33,7 +33,7 @@ from fdi_ros.config.config import Config, parameter_file, parameters_of
 from fdi_ros.errors import BagError, FdiError
 from fdi_ros.fleet.tables import Flight, FlightEpisode, Row, Tables
 from fdi_ros.inspection.segments import NoiseSegments
-from fdi_ros.inspection.starting_config import starting_config_of
+from fdi_ros.inspection.starting_config import starting_config_of, turned_units
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.output import Output
@@ -268,6 +268,11 @@ def _judged(
         start = starting_config_of(path, "no config")
         text = start.text
         unused = start.unused
+        config = Config.from_parameters(start.parameters)
+        if not calibrated and (turned := turned_units(path, config)):
+            raise BagError(
+                f"{turned}: give --config with the mounts that fdi setup finds"
+            )
     if calibrated:
         try:
             text = _calibrated(path, text)
@@ -349,8 +354,8 @@ def _row(known: Flight, summary: Summary) -> Flight:
     why: list[str] = []
     if found.severity is not Severity.GOOD:
         # A verdict lists only the first concerns, and none beside a fault.
-        rest = [str(one) for one in summary.concerns if str(one) not in found.sentence]
-        why = [found.sentence, *(f"{words}." for words in rest)]
+        rest = [one for one in summary.concerns if str(one) not in found.sentence]
+        why = [found.sentence, *(one.sentence for one in rest)]
     return replace(
         known,
         why=(*known.why, *why, *sample_rate_notes(stream.sample_rate)),

@@ -336,7 +336,7 @@ class Fleet:
         reasons = {
             "faulty": faulty,
             "not judged": failed,
-            "cannot be told": len(self.looks) - faulty - failed,
+            "to look at": len(self.looks) - faulty - failed,
         }
         words = ", ".join(
             f"{number} {reason}" for reason, number in reasons.items() if number
@@ -353,12 +353,12 @@ class Fleet:
         counts = (
             f"{_count(own['vehicles'], 'vehicle')}; {_count(own['not_judged'], 'flight')} could not be judged;"
             f" {_count(own['episodes'], 'fault')} declared, in {_count(declaring, 'flight')};"
-            f" {own['watched'] / 3600:.2f} hours judged while nothing stood declared."
+            f" {own['watched'] / 3600:.2f} hours judged without a declared fault."
         )
         damaged = f"{_count(own['damaged'], 'recording')} could not be read whole."
         assumed = (
-            f"Of {_count(own['not_measured'], 'flight')} the mounts and axes are what fdi inspect assumes, not"
-            " measured: what is declared there may be wrong (--config, --calibrate)."
+            f"For {_count(own['not_measured'], 'flight')} the mounts and axes are assumed, not measured, so"
+            " declarations may be wrong: give --config or --calibrate."
         )
         more = [damaged] if own["damaged"] else []
         more += [assumed] if own["not_measured"] else []
@@ -370,9 +370,8 @@ class Fleet:
             f"{shown(row['path'])}: {shown(' '.join(row['why']), LINE)}"
             for row in self.looks[:LOOKS]
         ]
-        more = (
-            [f"and {len(self.looks) - LOOKS} more"] if len(self.looks) > LOOKS else []
-        )
+        hidden = len(self.looks) - LOOKS
+        more = [f"and {hidden} more, in the page and tables"] if hidden > 0 else []
         return "".join(f"{line}\n" for line in [*self.lines(), *looks, *more])
 
     def html(self, about: Mapping[str, str]) -> str:

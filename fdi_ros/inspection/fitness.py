@@ -30,8 +30,9 @@ from fdi_ros.model.noise import noisier_words
 from fdi_ros.model.samples import LARGEST_GYRO_RANGE
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
+from fdi_ros.monitor.soundness import LEAST_DELIVERED
 from fdi_ros.report.layout import RADIANS, Unit
-from fdi_ros.system.text import figures, first_of, listed, shown
+from fdi_ros.system.text import LINE, figures, first_of, listed, shown
 
 _OF_A_MONITOR = {
     topic.name.rpartition("/")[2]
@@ -174,7 +175,7 @@ def refuse_unfit(bag: Path, config: Config) -> list[TopicReport]:
 
     `BagError` if a topic is in deg/s, stamps are of several clocks, or reading fails.
     """
-    chosen = [one for one in inspect(bag, config.topics)[0] if one.channels]
+    chosen = [one for one in inspect(bag, config.topics).reports if one.channels]
     if words := in_degrees(chosen, max(LARGEST_GYRO_RANGE, *config.health.max_rate)):
         raise BagError(f"{bag} needs {words}; mend the driver")
     if words := one_clock(chosen, config.imus.timeout):
@@ -254,11 +255,15 @@ def needs(reports: Sequence[TopicReport]) -> str:
 
 
 def recording_findings(
-    reports: Sequence[TopicReport], refused: str = "", unit: Unit = RADIANS
+    reports: Sequence[TopicReport],
+    refused: str = "",
+    unit: Unit = RADIANS,
+    unread: Sequence[tuple[str, str]] = (),
 ) -> Iterator[Finding]:
     """Yield the findings on a recording.
 
     ``refused``: reason why no config can be made, where the recording needs nothing.
+    ``unread``: gyros that cannot be read as such, and why.
     """
     chosen = candidates(reports)
     lacking = needs(reports) or refused
@@ -274,12 +279,12 @@ def recording_findings(
             f"{copies}; the copy is left out",
             headline="NEEDS A LOOK",
         )
-    for topic, why in left_out(reports):
-        if _NO_REDUNDANCY not in why:
-            words = f"{shown(topic)} is left out: {why}"
-            yield Finding(
-                Role.WARNING, "left out", words, (topic,), headline="READY, BUT LOOK"
-            )
+    looks = [
+        *(("left out", *one) for one in unused_topics(reports, unread)),
+        *(("delivered", *one) for one in _slow_topics(chosen)),
+    ]
+    for what, topic, words in looks:
+        yield Finding(Role.WARNING, what, words, (topic,), headline="READY, BUT LOOK")
     units = len(chosen) > 1
     names = [
         f"{shown(one.topic.name)} {place}" for one in chosen for place in one.places
@@ -301,6 +306,30 @@ def recording_findings(
         )
     yield Finding(Role.WORTH, "ready", words, headline="READY")
     yield from topic_findings(chosen, unit)
+
+
+def unused_topics(
+    reports: Sequence[TopicReport], unread: Sequence[tuple[str, str]] = ()
+) -> list[tuple[str, str]]:
+    """Return each gyro that is left out, copies aside, and a sentence with the reason.
+
+    ``unread``: gyros that cannot be read as such, and why.
+    """
+    return [
+        (topic, f"{shown(topic, LINE)} is left out: {why}")
+        for topic, why in (*left_out(reports), *unread)
+        if _NO_REDUNDANCY not in why
+    ]
+
+
+def _slow_topics(chosen: Sequence[TopicReport]) -> Iterator[tuple[str, str]]:
+    """Yield the topics that lack messages, compared with the best one, and how many."""
+    times = [one.received * one.interval for one in chosen]
+    for one, time in zip(chosen, times, strict=True):
+        if time < LEAST_DELIVERED * max(times):
+            share = 100 * time / max(times)
+            name = one.topic.name
+            yield name, f"{shown(name)} delivered {share:.0f} % of its messages"
 
 
 def topic_findings(

@@ -90,7 +90,7 @@ def starting_config_of(path: Path, refused: str) -> StartingConfig:
     ``refused``: first words of the `BagError` if there are no gyros in rad/s on one
     clock.
     """
-    reports, _ = inspect(path)
+    reports = inspect(path).reports
     if words := needs(reports):
         raise BagError(f"{refused}: needs {words}")
     if words := one_clock(candidates(reports)):
@@ -130,7 +130,7 @@ def assumed_config(path: Path) -> AssumedConfig:
         raise BagError(
             f"{refused}: no message states the axes of an array of channels; give them with --config"
         )
-    if turned := _turned_units(path, config):
+    if turned := turned_units(path, config):
         raise BagError(
             f"{refused}: {turned}. `fdi setup` measures the mounts and writes a config for --config"
         )
@@ -145,8 +145,10 @@ def assumed_config(path: Path) -> AssumedConfig:
     return AssumedConfig(config, words, found.unused)
 
 
-def _turned_units(path: Path, config: Config) -> str:
+def turned_units(path: Path, config: Config) -> str:
     """Name the units that measure the motion of the first one along other axes, may be empty."""
+    if not config.imus.topics:
+        return ""
     size = max(1, round(WINDOW * config.sample_rate))
     names = config.imus.names
     with Recording(path) as recording:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -161,12 +161,21 @@ class TopicReport:
         return not self.segments.empty
 
 
-def inspect(
-    path: Path, topics: Sequence[str] = ()
-) -> tuple[list[TopicReport], tuple[str, ...]]:
+class Inspection(NamedTuple):
+    """What reading a recording once shows."""
+
+    #: one per topic
+    reports: list[TopicReport]
+    #: lines about damage
+    damage: tuple[str, ...]
+    #: gyros that cannot be read as such, and why
+    unread: tuple[tuple[str, str], ...]
+
+
+def inspect(path: Path, topics: Sequence[str] = ()) -> Inspection:
     """Read a recording once, all topics or those with these names (first slash optional).
 
-    Returns one report per topic, and lines about damage. `BagError` if reading fails.
+    `BagError` if reading fails.
     """
     with Recording(path) as recording:
         wanted = {name.lstrip("/") for name in topics}
@@ -193,7 +202,8 @@ def inspect(
                 )
         for report in reports:
             _settle(report)
-        return reports, recording.damage.report()
+        damage = recording.damage
+        return Inspection(reports, damage.report(), tuple(damage.left_out))
 
 
 def _update(report: TopicReport, batch: Batch, rows: Int) -> None:

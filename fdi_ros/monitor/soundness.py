@@ -141,9 +141,16 @@ class Concern(NamedTuple):
     """``or``: about one of the names, and which one is not known."""
     is_noise: bool = False
     """Whether it is about noise for a time."""
+    is_delivery: bool = False
+    """Whether it is about messages that a unit did not deliver."""
 
     def __str__(self) -> str:
         return f"{listed(short_names(self.who), self.joined_by)} {self.words}"
+
+    @property
+    def sentence(self) -> str:
+        """The concern as a sentence. Names of channels keep their small letters."""
+        return f"{self}.".replace("the fused", "The fused", 1)
 
 
 PASSES = 20
@@ -210,7 +217,10 @@ def concerns_of(
             ),
         ),
         *(Concern(Word.LOOK, (topic,), f"is left out: {why}") for topic, why in unused),
-        *(Concern(Word.LOOK, (unit.name,), _slow_words(unit)) for unit in slow),
+        *(
+            Concern(Word.LOOK, (unit.name,), _slow_words(unit), is_delivery=True)
+            for unit in slow
+        ),
         *(
             Concern(
                 Word.LOOK,

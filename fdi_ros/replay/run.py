@@ -601,7 +601,8 @@ def _stream_result(samples: Samples, settings: Config, judge: Judge) -> StreamRe
         malformed=samples.malformed,
         disordered=samples.disordered,
         alignment=dict(zip(samples.topics, counters, strict=True)),
-        damage=samples.recording.damage.report(),
+        damage=samples.recording.damage.losses(),
+        facts=tuple(samples.recording.damage.facts),
         unused=tuple(samples.recording.damage.left_out),
     )
 

@@ -140,6 +140,8 @@ class StreamResult:
     """What could not be read, one line for each place."""
     unused: tuple[tuple[str, str], ...] = ()
     """Topics of gyros that were left out, and why."""
+    facts: tuple[str, ...] = ()
+    """What readers of the recording must know, and is no damage."""
 
 
 class ReplayVerdict(NamedTuple):

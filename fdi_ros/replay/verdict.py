@@ -81,6 +81,21 @@ def faulty_episodes(judgement: Judgement) -> list[Episode]:
     return [*declared, *silent]
 
 
+def silent_units(judgement: Judgement) -> dict[str, float]:
+    """Return the units that the verdict calls silent to the end, and since when, s."""
+    since = {
+        name: one.start_s
+        for one in faulty_episodes(judgement)
+        if not one.declares
+        for name in one.channels
+    }
+    return {
+        one.unit: since[one.name]
+        for one in judgement.monitor.channels
+        if one.unit and one.name in since
+    }
+
+
 def unjudged_words(judgement: Judgement) -> str:
     """Return why the recording as a whole was not judged. Empty: it was judged."""
     scores = judgement.scores

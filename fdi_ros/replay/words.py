@@ -13,7 +13,7 @@ from fdi_ros.faults.fault import ACCELEROMETERS
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import UNUSED_COUNTERS
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
-from fdi_ros.monitor.soundness import UnitHealth, Word
+from fdi_ros.monitor.soundness import Concern, UnitHealth, Word
 from fdi_ros.replay.episodes import (
     MOST_TOLD,
     Episode,
@@ -28,6 +28,7 @@ from fdi_ros.replay.verdict import (
     LASTING,
     MOST_CONCERNS,
     noise_behind,
+    silent_units,
     unjudged_words,
     verdict_of,
     wrongly_named,
@@ -74,8 +75,26 @@ def _concern_lines(summary: Summary) -> list[str]:
     word = verdict_of(summary).word
     deciding = [one for one in summary.concerns if one.word.value == word]
     said = [*deciding[:MOST_CONCERNS], *noise_behind(summary)[:MOST_CONCERNS]]
-    others = [one for one in summary.concerns if one not in said]
-    return [f"{str(one).replace('the fused', 'The fused', 1)}." for one in others]
+    others = [one for one in _beside_silence(summary) if one not in said]
+    return [one.sentence for one in others]
+
+
+def _beside_silence(summary: Summary) -> list[Concern]:
+    """Return the concerns, without those that repeat that a unit is silent to the end."""
+    silent = silent_units(summary)
+    explained = {
+        one.name
+        for one in summary.monitor.units
+        if one.name in silent
+        and one.slow_to_s is None
+        and one.slow_from_s is not None
+        and one.slow_from_s >= silent[one.name] - LASTING
+    }
+    return [
+        one
+        for one in summary.concerns
+        if not (one.is_delivery and explained.issuperset(one.who))
+    ]
 
 
 def _name_lines(summary: Summary) -> list[str]:
@@ -109,11 +128,14 @@ def unchecked_words(channels: Sequence[ChannelResult]) -> str:
 
 
 def _unchecked_lines(summary: Summary) -> list[str]:
-    """Name the channels that were not checked at the end."""
+    """Name the channels that were not checked at the end, unless the verdict does."""
+    silent = silent_units(summary)
     lost = [
         one
         for one in summary.unchecked_channels
-        if one.since_s is not None and summary.scores.end_s - one.since_s >= LASTING
+        if one.unit not in silent
+        and one.since_s is not None
+        and summary.scores.end_s - one.since_s >= LASTING
     ]
     return [f"Not checked at the end: {unchecked_words(lost)}."] if lost else []
 
@@ -122,7 +144,7 @@ def notes(summary: Summary) -> list[str]:
     """Return notes on damage, unused messages and limits of the monitor."""
     stream = summary.stream
     scores = summary.scores
-    lines = [*stream.damage, *sample_rate_notes(stream.sample_rate)]
+    lines = [*stream.facts, *stream.damage, *sample_rate_notes(stream.sample_rate)]
     lines += [
         f"{topic}: malformed messages: {count}"
         for topic, count in stream.malformed.items()
@@ -298,7 +320,7 @@ def _trouble_words(
         one for one in summary.story.episodes if not names.isdisjoint(one.channels)
     ]
     words = [f"{one.state.lower()} from {one.start_s:.1f} s" for one in faults[:1]]
-    for one in summary.concerns:
+    for one in _beside_silence(summary):
         about = [name for name in own if name in one.who]
         if about and len(about) < len(own):
             axes = listed([name.rpartition(".")[2] for name in short_names(about)])

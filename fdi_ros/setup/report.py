@@ -20,7 +20,7 @@ from fdi_ros.inspection.findings import (
     lines_of,
     verdict_of,
 )
-from fdi_ros.inspection.fitness import copy_words, topic_findings
+from fdi_ros.inspection.fitness import copy_words, topic_findings, unused_topics
 from fdi_ros.inspection.topics import topic_columns
 from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array
@@ -510,6 +510,10 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
     yield from _not_shown(found, unit)
     if words := copy_words(found.reports):
         yield Finding(Role.WARNING, "copy", words, headline="USABLE, BUT LOOK")
+    for topic, words in unused_topics(found.reports):
+        yield Finding(
+            Role.WARNING, "left out", words, (topic,), headline="USABLE, BUT LOOK"
+        )
     yield from topic_findings(found.chosen, unit)
     tried = found.proof.before if found.kept else found.proof.after
     if tried.baseline is not None:

@@ -274,7 +274,7 @@ def set_up(
     the proof, by default a part of this one. `FdiError` if the recording is unreadable
     or has no gyros, or no monitor can be built.
     """
-    reports, damage = inspect(bag)
+    reports, damage, _ = inspect(bag)
     chosen = candidates(reports)
     lacking = needs(reports)
     if not chosen:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import difflib
 import html
 import math
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Collection, Iterable, Sequence
 from datetime import datetime, timezone
 
 from fdi_ros.system.files import EARLIEST, LATEST
@@ -49,6 +50,29 @@ def visible(text: str, kept: str = "\n\t") -> str:
 def listed(words: Sequence[str], last: str = "and") -> str:
     """Join words as a sentence lists them: ``a, b and c``."""
     return f" {last} ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+
+
+_NUMBER = re.compile(r"([A-Za-z]*)_?([0-9]+)")
+LONGEST_NUMBER = 9
+"""Digits of a number that may tell names apart; longer ones are serial numbers."""
+
+
+def own_numbers(names: Sequence[str], words: Collection[str] = ()) -> list[int]:
+    """Return the first number of each name that tells all names apart, or nothing.
+
+    The word before it is the same in all names, and one of ``words`` if any are given:
+    ``/imu_4/data`` and ``/imu_5/data`` give 4 and 5.
+    """
+    found = [_NUMBER.findall(name) for name in names]
+    for numbered in zip(*found, strict=False):
+        before = {word.lower() for word, _ in numbered}
+        numbers = [
+            int(digits) for _, digits in numbered if len(digits) <= LONGEST_NUMBER
+        ]
+        same = len(before) == 1 and (not words or before <= set(words))
+        if same and len(set(numbers)) == len(names):
+            return numbers
+    return []
 
 
 def first_of(

@@ -47,13 +47,15 @@ def test_columns_are_those_that_their_names_say(tmp_path, names):
     others = ["acc_x", "acc_y", "acc_z", "temperature"]
     table = np.hstack([RATES, np.full((len(RATES), 4), 9.0)])
     found, damage = messages(write(tmp_path, [*names, *others], rates=table))
-    assert list(found) == ["/imu_0", "/imu_1"]
+    # An IMU keeps its number.
+    topics = ["/imu_1", "/imu_2"] if "1" in names[1] else ["/imu_0", "/imu_1"]
+    assert list(found) == topics
     for k, (stamp, rate, _) in enumerate(found.values()):
         assert (stamp == np.round(TIME * 1e6) * 1000).all()
         assert (rate == RATES[:, 3 * k : 3 * k + 3]).all()
     assert damage == (
-        f"flight.csv: columns, by their names: time = {names[0]}; /imu_0 = {', '.join(names[1:4])}; /imu_1 ="
-        f" {', '.join(names[4:])}"
+        f"flight.csv: columns, by their names: time = {names[0]}; {topics[0]} ="
+        f" {', '.join(names[1:4])}; {topics[1]} = {', '.join(names[4:])}"
         + ("" if "rad" in names[1] else "; no unit in the names: rad/s assumed"),
     )
 
@@ -103,7 +105,7 @@ def test_accelerations_stand_beside_the_rates_in_the_unit_of_their_name(
         assert (rate == RATES[:, 3 * k : 3 * k + 3]).all()
     # Of one accelerometer beside two gyros nothing tells whose it is.
     path = write(tmp_path, [*named("gyro_{k}_{axis}"), *others[:3]], rates=table[:, :9])
-    message = deserialize_message(messages(path)[0]["/imu_0"][2][7], Imu)
+    message = deserialize_message(messages(path)[0]["/imu_1"][2][7], Imu)
     assert message.linear_acceleration_covariance[0] == -1.0
 
 
@@ -127,7 +129,7 @@ def test_a_table_of_a_spreadsheet_has_decimal_commas_a_comment_and_text(
     lines[2] = delimiter.join(names)
     path.write_text("\r\n".join(lines) + "\r\n")
     found, _ = messages(path)
-    assert (found["/imu_1"][1] == RATES[:, 3:]).all()
+    assert (found["/imu_2"][1] == RATES[:, 3:]).all()
 
 
 IMUS = "imus: [[p1, q1, r1], [p2, q2, r2]]\n"
@@ -148,8 +150,8 @@ def test_columns_yaml_says_what_names_do_not(tmp_path):
     about = tmp_path / "columns.yaml"
     about.write_text(f"time: t\ntime_unit: ms\nrate_unit: deg/s\n{IMUS}")
     found, _ = messages(path)
-    np.testing.assert_allclose(found["/imu_1"][1], RATES[:, 3:], rtol=1e-12)
-    assert (found["/imu_0"][0] == np.round(TIME * 1e6) * 1000).all()
+    np.testing.assert_allclose(found["/imu_2"][1], RATES[:, 3:], rtol=1e-12)
+    assert (found["/imu_1"][0] == np.round(TIME * 1e6) * 1000).all()
     for text, words in (
         ("imus: [[p1, q1]]", "imus is a list of three columns for each IMU"),
         ("imus: [[p1, q1, z9], [p2, q2, r2]]", "has no column 'z9', it has k, t, p1"),
@@ -196,8 +198,8 @@ def test_an_imu_without_values_in_a_line_has_no_message_there(
     )
     found, damage = messages(path)
     assert [len(one[0]) for one in found.values()] == [len(TIME), len(TIME) // 2]
-    assert np.isnan(found["/imu_0"][1][99]).tolist() == [True, False, False]
-    assert (found["/imu_1"][1] == RATES[1::2, 3:]).all()
+    assert np.isnan(found["/imu_1"][1][99]).tolist() == [True, False, False]
+    assert (found["/imu_2"][1] == RATES[1::2, 3:]).all()
     assert [line.partition(": ")[2] for line in damage[1:]] == [
         "the last line is not finished and was left out",
         "1 lines without a time were left out",
@@ -268,6 +270,24 @@ def test_names_of_columns_are_matched_in_a_time_that_follows_from_their_size(
     path.write_text(",".join(names) + "\n" + "0," * (len(names) - 1) + "0\n")
     with bounded(10):
         assert words in refusal(path)
+
+
+def test_columns_of_one_name_are_refused_and_those_of_another_unit_are_left_out(
+    tmp_path, fdi
+):
+    table = np.hstack([RATES, RATES[:, 3:]])
+    again = [*named("gyro_{k}_{axis}"), *(f"gyro_2_{axis}" for axis in AXES)]
+    words = "flight.csv has 2 columns 'gyro_2_x': give each a name of its own"
+    assert words in refusal(write(tmp_path, again, rates=table))
+    again[7:] = [f"gyro_2_{axis} [deg/s]" for axis in AXES]
+    path = write(tmp_path, again, rates=table)
+    found, damage = messages(path)
+    assert list(found) == ["/imu_1", "/imu_2"]
+    assert "gyro_2_z [deg/s] are left out: a column before" in damage[1]
+    # What a replay says of the gyro, fdi inspect says too.
+    assert fdi("inspect", path).out.startswith(
+        "READY, BUT LOOK: the gyro of gyro_2_x [deg/s], gyro_2_y [deg/s], gyro_2_z [deg/s] is left out"
+    )
 
 
 def test_verbs_read_a_table_and_a_fleet_passes_others_by(tmp_path, fdi):

@@ -296,6 +296,13 @@ def test_one_sensor_on_two_topics_needs_a_look(tmp_path):
     )
 
 
+def test_units_mounted_otherwise_are_not_judged_without_a_config(root):
+    path = root / "bags" / "cone_flight"
+    row = judge.judge(path, Flight(str(path), "", ""), "", False)[0]
+    assert row.error.startswith("imu_2 is turned by 109 deg against imu_1: give")
+    assert "could not be judged" in row.why[0]
+
+
 def test_without_a_config_that_of_inspect_is_taken_and_said(
     fleet, root, tmp_path, capsys
 ):
@@ -304,7 +311,7 @@ def test_without_a_config_that_of_inspect_is_taken_and_said(
     assert (row["error"], row["measured"]) == ("", False)
     assert Config.from_file(row["config"]).topics == TOPICS
     assert (
-        "Of 1 flight the mounts and axes are what fdi inspect assumes, not measured"
+        "For 1 flight the mounts and axes are assumed, not measured"
         in capsys.readouterr().out
     )
     given = (

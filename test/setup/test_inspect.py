@@ -31,7 +31,7 @@ def test_rates_gaps_and_noise_are_found(tmp_path):
     messages, _ = flight(2000)
     gap = range(START + 500 * STEP, START + 540 * STEP)
     kept = [m for m in messages if m[0] == TOPICS[0] or m[1] not in gap]
-    reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", kept))
+    reports, damage, _ = inspect(write_mcap(tmp_path / "bag.mcap", kept))
     first, second = reports
     assert damage == ()
     assert (first.received, first.gaps, second.received, second.gaps) == (
@@ -87,7 +87,7 @@ def test_what_could_be_gyros_and_what_could_not(tmp_path):
         ]
         messages += [("/imu", at, imu(at, random.normal(0, 0.01, 3)))]
     types = {"/six": ARRAY, "/three": ARRAY}
-    reports, _ = inspect(write_mcap(tmp_path / "bag.mcap", messages, types=types))
+    reports, *_ = inspect(write_mcap(tmp_path / "bag.mcap", messages, types=types))
     assert {report.topic.name for report in reports if report.could_be_gyros} == {
         "/six",
         "/imu",
@@ -112,7 +112,7 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
         messages += [
             (TOPICS[0], messages[-1][1] + STEP, imu(messages[-1][1] + STEP, rate))
         ]
-    reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", messages))
+    reports, damage, _ = inspect(write_mcap(tmp_path / "bag.mcap", messages))
     assert [report.repeats.count.tolist() for report in reports] == [
         [150, 0, 200],
         [0, 0, 0],
@@ -162,7 +162,7 @@ def test_noise_in_motion_is_told_apart_from_that_at_rest_of_each_unit_and_writte
     z += np.random.default_rng(1).normal(0, [0.002] * 3 + [0.004] * 3, (3000, 6))
     z[5, 0] = np.nan
     messages = imu_messages(START + STEP * k[:, 0], z)
-    reports, damage = inspect(write_mcap(tmp_path / "bag.mcap", messages))
+    reports, damage, _ = inspect(write_mcap(tmp_path / "bag.mcap", messages))
     for report, quiet in zip(reports, (0.002, 0.004), strict=True):
         np.testing.assert_allclose(report.segments.noise().quiet, quiet, rtol=0.2)
         np.testing.assert_allclose(
