@@ -22,6 +22,7 @@ doubles, so dates are exact to 0.3 us. Files are read in portions of bounded mem
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import csv
 import math
@@ -131,7 +132,8 @@ class CsvLog(FlightLog):
     refusal = "is no table of text (.csv)"
     kinds = (KIND,)
     settings = (
-        f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit?"
+        f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit,"
+        " and do times differ from line to line?"
     )
     one_imu = "one IMU cannot be checked: this table has no other ({})"
     slowest = 5.0
@@ -237,12 +239,17 @@ def find_columns(
     line holds names, or no name is of a gyro.
     """
     file.seek(0)
+    if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        raise BagError(f"{file.name} is UTF-16: save it as UTF-8")
+    file.seek(0)
     for _ in range(64):
         line = file.readline(CSV_LINE_BYTES).decode("utf-8", "replace")
         if sum(map(line.count, ",;\t")) >= 3 and len(line) < CSV_LINE_BYTES:
             break
     else:
-        raise BagError(f"{file.name} has no line with the names of its columns")
+        raise BagError(
+            f"{file.name} has no line with four or more names of columns, between commas, semicolons or tabs"
+        )
     delimiter = max("\t;,", key=line.count)
     names = [
         name.strip().strip('"')

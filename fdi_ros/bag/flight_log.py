@@ -66,6 +66,8 @@ _MAX_TIME_STEP = 10_000_000
 _LOG_BATCH = 1 << 10
 #: instances of one kind, more than any autopilot has, that are looked at for copies
 _MOST_COMPARED = 16
+#: share of a log that must be read for a verdict on the whole of it
+LEAST_READ = 0.9
 #: messages that are named of a log without IMUs
 _MOST_NAMES = 6
 #: board and its serial number, as ArduPilot sends both at its start
@@ -244,6 +246,10 @@ class FlightLog(BagFile):
         try:
             while not self._survey():
                 pass
+            if self.end < LEAST_READ * self.size:
+                share = 100 * (self.size - self.end) / self.size
+                rest = f"the last {share:.0f} % of {self.path.name}"
+                self.leave_out(rest, "the time steps back before it")
             self._sources = self._choose()
         except BaseException:  # Close the file whatever ends the opening.
             self.close()

@@ -66,7 +66,7 @@ def shipped(kind: str) -> str:
     return ", ".join(path.name for path in shipped_files() if path.parent.name == kind)
 
 
-_CONFIG = "ROS 2 parameter file{}, a shipped one by its name alone; may be repeated, later ones win"
+_CONFIG = "ROS 2 parameter file{}. The name alone gives a shipped one. May be repeated, later ones win"
 DETECTOR_NAMES = ", ".join(reversed(DETECTORS))
 """Names of the detectors for the help, the default first."""
 SHARED: Mapping[str, Options] = {

@@ -199,7 +199,7 @@ def _replay_text(replayed: _Replayed) -> str:
     """Return the result of one replay for a terminal, the verdict first."""
     text = summary_text(replayed.summary, unit_of(replayed.task.arguments.degrees))
     if replayed.failover is not None:
-        text += f"{replayed.failover.text}\n"
+        text += f"{replayed.failover.text(replayed.summary.stream.origin_ns)}\n"
     return text + _config_notes(replayed.task)
 
 

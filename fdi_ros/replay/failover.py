@@ -46,6 +46,14 @@ class _Sample(NamedTuple):
     states: list[float]
 
 
+class _Done(NamedTuple):
+    """An order of failover."""
+
+    words: str
+    #: from the first sample, ns
+    at: int
+
+
 class FailoverReplay(Sink):
     """Asks the policy of failover in a recording, with the evidence of a live vehicle.
 
@@ -70,7 +78,7 @@ class FailoverReplay(Sink):
         self._first: int | None = None  # stamp of the first sample, ns
         self._next = 0
         self._until = 0  # the policy is asked until this time, ns
-        self._done: list[str] = []
+        self._done: list[_Done] = []
         self.begin_stretch()
 
     def begin_stretch(self) -> None:
@@ -125,8 +133,7 @@ class FailoverReplay(Sink):
         for k, in_use in decision.orders:
             if self._use[k] != in_use:
                 words = "in use again" if in_use else "out of use"
-                at = (now - BEGIN) / NS
-                self._done.append(f"{self._name(k)} {words} at {at:.1f} s")
+                self._done.append(_Done(f"{self._name(k)} {words}", now - BEGIN))
             self._use[k] = in_use
 
     def _name(self, imu: int) -> str:
@@ -135,12 +142,16 @@ class FailoverReplay(Sink):
         numbered = re.fullmatch(r"imu_([1-9])", unit)
         return f"IMU {numbered[1]}" if numbered else imu_name(imu, self._channels)
 
-    @property
-    def text(self) -> str:
-        """The orders in one line."""
+    def text(self, origin: int | None = None) -> str:
+        """Return the orders in one line.
+
+        ``origin``: stamp from which times count, ns. None: that of the first sample.
+        """
+        shift = 0 if origin is None or self._first is None else self._first - origin
+        done = [f"{one.words} at {(one.at + shift) / NS:.1f} s" for one in self._done]
         least = self._settings.min_size
-        none = f"no IMU would be taken out (failover_min_size {least:g} rad/s)"
-        return f"failover, if armed: {'; '.join(self._done) or none}"
+        none = f"no IMU out of use (it acts from {least:g} rad/s on)"
+        return f"failover, if armed: {'; '.join(done) or none}"
 
 
 def is_possible(channels: Sequence[str]) -> bool:

@@ -63,12 +63,14 @@ def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
 
 
 def faulty_episodes(judgement: Judgement) -> list[Episode]:
-    """Return the episodes that make a recording FAULTY, isolated channels first.
+    """Return the episodes that make a recording FAULTY, those that last to its end first.
 
-    These are the declarations, and units that are silent to the end.
+    These are the declarations, isolated channels before sets, and units that are silent
+    to the end.
     """
     declared = sorted(
-        judgement.story.declared, key=lambda one: (one.state != "FAULTY", one.start_s)
+        judgement.story.declared,
+        key=lambda one: (not one.stands, one.state != "FAULTY", one.start_s),
     )
     silent = [
         one
@@ -101,9 +103,10 @@ def unjudged_words(judgement: Judgement) -> str:
     scores = judgement.scores
     bias = judgement.monitor.bias
     if scores.samples_judged == 0:
-        return (
-            f"none of {scores.samples} samples was judged (start-up bias: {bias.state})"
-        )
+        words = f"none of {scores.samples} samples was judged"
+        if bias.state == "learning":
+            return f"{words}, because the biases were still being learned"
+        return f"{words} (start-up bias: {bias.state})"
     share = scores.samples_judged / scores.samples
     if share < LEAST_JUDGED:
         return f"only {100 * share:.1f} % of {scores.samples} samples were judged"
@@ -185,7 +188,7 @@ def _faulty_sentences(
         sentences.append(f"First seen at {first.start_s:.1f} s.")
     others = dict.fromkeys(one.who for one in faulty[1:] if one.who != first.who)
     if others:
-        sentences.append(f"Later also {first_of(list(others), MOST_TOLD)}.")
+        sentences.append(f"Also {first_of(list(others), MOST_TOLD)}.")
     sentences += [f"{one}." for one in noise_behind(judgement)[:MOST_CONCERNS]]
     return " ".join(sentences)
 
@@ -293,7 +296,7 @@ def _size_sentences(one: Episode, unit: Unit) -> list[str]:
     if courses == {"growing"} or courses == {"shrinking"}:
         verb = "grows" if courses == {"growing"} else "shrinks"
         begins = {_size(size, unit) for size in sizes.values()}
-        if len(begins) == 1:
+        if len(begins) == 1 and all(map(_is_plain, sizes.values())):
             ends = listed(
                 [
                     f"{_rate(size.last_rad_s, size.std_rad_s, unit)}{f' ({axis})' if axis else ''}"
@@ -324,6 +327,10 @@ def _size_words(size: Size, unit: Unit) -> str:
         return ""
     if size.course == "gone":
         return f"was off by {value} {unit.name} until {size.gone_s:.1f} s"
+    if size.course in ("growing", "shrinking") and not _is_plain(size):
+        first = _signed(size.rad_s, size.std_rad_s, unit)
+        last = _signed(size.last_rad_s, size.std_rad_s, unit)
+        return f"is off by {first}, changing to {last} {unit.name}"
     if size.course in ("growing", "shrinking"):
         last = _rate(size.last_rad_s, size.std_rad_s, unit)
         return f"is off by {value}, {size.course} to {last} {unit.name}"
@@ -348,6 +355,16 @@ def _reason_sentences(one: Episode) -> list[str]:
 
 def _size(size: Size, unit: Unit) -> str:
     return _rate(size.rad_s, size.std_rad_s, unit)
+
+
+def _is_plain(size: Size) -> bool:
+    """Whether an error keeps its sign, and its size grows if its course does."""
+    grows = abs(size.last_rad_s) > abs(size.rad_s)
+    return size.rad_s * size.last_rad_s > 0.0 and grows == (size.course == "growing")
+
+
+def _signed(value: float, std: float, unit: Unit) -> str:
+    return f"{'-' if value < 0.0 else '+'}{_rate(value, std, unit)}"
 
 
 def _rate(value: float, std: float, unit: Unit) -> str:

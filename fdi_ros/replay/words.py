@@ -163,7 +163,8 @@ def notes(summary: Summary) -> list[str]:
         lines += [f"{topic}: {unused}"] if unused else []
     if missing := scores.samples - scores.samples_with_rate:
         bias = summary.monitor.bias.state
-        lines.append(f"no fused rate in {missing} samples (start-up bias: {bias})")
+        state = "" if bias == "learned" else f" (start-up bias: {bias})"
+        lines.append(f"no fused rate in {missing} of {scores.samples} samples{state}")
     lines += stretch_words(summary.story)
     return [*lines, summary.monitor.note] if summary.monitor.note else lines
 
@@ -223,15 +224,16 @@ def _unexplained_lines(summary: Summary, unit: Unit) -> list[str]:
         if name not in scores.struck
     )
     if doubted:
-        names = ", ".join(doubted)
-        return [f"No other channel was declared faulty, but {names} was in a set."]
+        verb = "was a candidate" if len(doubted) == 1 else "were candidates"
+        names = listed(list(doubted))
+        return [f"No other channel was declared faulty, but {names} {verb} for a time."]
     return ["No other channel was declared faulty."]
 
 
 def _time(seconds: float | None) -> str:
     if seconds is None:
         return "-"
-    return f"{1000 * seconds:.0f} ms" if seconds < 10 else f"{seconds:.1f} s"
+    return f"{1000 * seconds:.0f} ms" if seconds < 1 else f"{figures(seconds)} s"
 
 
 # Tables for a terminal

@@ -4,6 +4,7 @@
 """Tables of text: which columns are read by their names or as asked, their units and times, and what is damaged."""
 
 import os
+import re
 
 import numpy as np
 import pytest
@@ -227,11 +228,11 @@ def test_an_imu_without_values_in_a_line_has_no_message_there(
             "has columns of 2 IMUs at times that do not advance",
         ),
         ("t,gx,gy,gz\n" + "1" * (CSV_LINE_BYTES << 2), "has a line of more than"),
-        ("t," * CSV_LINE_BYTES, "has no line with the names"),
+        ("t," * CSV_LINE_BYTES, "has no line with four or more names"),
         (
             "t,gx,gy,gz,gx1,gy1,gz1\n"
             + "".join(f"{10 * k},0,0,0,0,0,0\n" for k in range(50)),
-            "does the name of the time have its unit (time_ms), or columns.yaml a time_unit?",
+            "does the name of the time have its unit (time_ms), or columns.yaml a time_unit,",
         ),
     ],
     ids=[
@@ -288,6 +289,25 @@ def test_columns_of_one_name_are_refused_and_those_of_another_unit_are_left_out(
     assert fdi("inspect", path).out.startswith(
         "READY, BUT LOOK: the gyro of gyro_2_x [deg/s], gyro_2_y [deg/s], gyro_2_z [deg/s] is left out"
     )
+
+
+def test_a_table_in_utf_16_is_refused(tmp_path):
+    path = write(tmp_path, named("gyro_{k}_{axis}"))
+    path.write_text(path.read_text(), encoding="utf-16")
+    assert refusal(path).endswith("is UTF-16: save it as UTF-8")
+
+
+def test_a_table_whose_time_steps_back_is_not_healthy(tmp_path, fdi):
+    """What is behind the step, half of it, was not judged."""
+    made = units(2, seconds=20.0)
+    time = (made[0].stamp - made[0].stamp[0]) * 1e-6
+    time[len(time) // 2 :] -= 9.0
+    rates = np.hstack([unit.rate for unit in made]).astype(float)
+    path = write(tmp_path, named("gyro_{k}_{axis}"), time, rates)
+    words = r"but the last \d\d % of flight.csv is left out: the time steps back"
+    out = fdi("replay", path)
+    assert out.code == 4
+    assert re.search(words, out.out.splitlines()[0])
 
 
 def test_verbs_read_a_table_and_a_fleet_passes_others_by(tmp_path, fdi):

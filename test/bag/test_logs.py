@@ -692,7 +692,7 @@ def test_of_a_default_log_of_px4_the_means_are_a_coarse_check(tmp_path):
     for unit, late in zip(made, (0, 20_000, -15_000), strict=True):
         unit.stamp += late
     made[2].stamp[30:40] += 200_000
-    found, (said, _) = messages(log(tmp_path, "vehicle_imu_status", made))
+    found, (_, said) = messages(log(tmp_path, "vehicle_imu_status", made))
     kept = np.delete(np.arange(60), np.arange(30, 40))
     for unit, (stamp, rate, _) in zip(made, found.values(), strict=True):
         assert (stamp == UTC + (made[0].stamp[kept] - 50_000 - FIX) * 1000).all()

@@ -544,8 +544,8 @@ def test_sentence_and_table_agree_on_two_faults_at_once():
         Severity.GOOD,
         "2 of 2 injected faults detected, 2 isolated.",
     )
-    words = "detected after 2000 ms as one of g1, g4, g6, isolated after 4000 ms."
-    last = "No other channel was declared faulty, but g4 was in a set."
+    words = "detected after 2 s as one of g1, g4, g6, isolated after 4 s."
+    last = "No other channel was declared faulty, but g4 was a candidate for a time."
     assert sentences(told) == [f"bias on g1: {words}", f"bias on g6: {words}", last]
     unjudged = summary_of(replace(told.scores, samples_judged=0))
     assert sentences(unjudged)[-1].startswith(

@@ -196,7 +196,7 @@ def test_a_recording_in_which_nothing_was_checked_is_not_called_sound(tmp_path):
     severity, words = summary.verdict.severity, summary.verdict.sentence
     assert severity is Severity.UNKNOWN
     assert words.startswith(
-        "CANNOT TELL: none of 200 samples was judged (start-up bias: learning)."
+        "CANNOT TELL: none of 200 samples was judged, because the biases were still being"
     )
     assert (
         failures(parse_check("false=0", 0), summary)[0]
