@@ -36,7 +36,8 @@ coverage: venv ## share of the lines of Python that the quicker tests run, witho
 	@$(RUN) python -m fdi_ros.cli compile
 	@$(RUN) python -m pip install --quiet pytest-cov
 	@mkdir -p build
-	@$(RUN) python -m pytest --collect-only -q $(UNSEEN:%=--ignore=%) | awk '/::/ && n++ % $(EVERY) == 0' > build/covered
+	@$(RUN) python -m pytest --collect-only $(UNSEEN:%=--ignore=%) | awk '/::/ && n++ % $(EVERY) == 0' > build/covered
+	@test -s build/covered
 	@$(RUN) python -m pytest -n $(WORKERS) --dist worksteal --cov @build/covered $(ARGS)
 
 check: venv ## style and types
