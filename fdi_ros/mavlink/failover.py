@@ -88,6 +88,7 @@ class Failover:
         path: Path,
         clocks: Callable[[], Clocks],
     ) -> None:
+        vehicle.keeps_system = True
         self._vehicle = vehicle
         self._channels = channels
         self._settings = settings
@@ -106,7 +107,7 @@ class Failover:
             vehicle.events.append(self._file.trouble)
         saved = self._file.written
         self._system = saved.system
-        self._state = PolicyState.begin(count, saved.out)
+        self._state = PolicyState.begin(count, saved.out, saved.without_notch)
         self._values: list[tuple[bool | None, int]] = [(None, 0)] * count
         self._lanes: int | None = None  # of `EKF_LANES`. None: not reported
         self._conversation = 0
@@ -121,12 +122,23 @@ class Failover:
         self._lost = math.nan  # share of messages lost of late
         self._ready: tuple[str, int] = ("", 0)  # the present reason, and since when
         self._told: str | None = None  # the reason announced last
+        self._doubted = False  # announced while an IMU is out of use
 
     @property
     def out(self) -> tuple[int, ...]:
         """IMUs, from 0, that are, or may be, out of use by our orders."""
         memories = self._state.memories
         return tuple(k for k, memory in enumerate(memories) if memory.ours)
+
+    @property
+    def _is_same(self) -> bool:
+        """Whether the IMUs out of use are those of the present autopilot."""
+        return self._vehicle.system == self._system or not self.out
+
+    @property
+    def _without_notch(self) -> tuple[int, ...]:
+        memories = self._state.memories
+        return tuple(k for k, memory in enumerate(memories) if memory.without_notch)
 
     @property
     def is_done(self) -> bool:
@@ -179,6 +191,7 @@ class Failover:
             booted=clocks.unix - ago,
             after=clocks.uptime - ago,
             computer=clocks.boot,
+            without_notch=self._without_notch,
         )
 
     def restore(self, now: int) -> tuple[bool, str]:
@@ -198,8 +211,10 @@ class Failover:
             is_saved = self._file.written.out == self.out
             unsaved = "" if is_saved else "; failover_file is not written"
             words = f"out of use: {names} of system {self._system}{unsaved}"
-            reboot = any(memory.without_notch for memory in self._state.memories)
-            return Level.WARN, words + ("; reboot before flight" if reboot else "")
+            ending = "; reboot before flight" if self._without_notch else ""
+            if not self._is_same:
+                ending = f"; no failover of system {self._vehicle.system}"
+            return Level.WARN, words + ending
         why = self._not_ready(self._view(now), now)
         return (Level.WARN, f"no failover: {why}") if why else (Level.OK, "ready")
 
@@ -275,8 +290,6 @@ class Failover:
     def _view(self, now: int, restore: bool = False) -> View:
         vehicle = self._vehicle
         evidence = self.evidence
-        # Parameters of another system do not count for the one with an IMU out.
-        is_same = vehicle.system == self._system or not self.out
         delivers = [
             k in vehicle.units and now - vehicle.units[k].last < SILENCE
             for k in range(len(self._values))
@@ -285,7 +298,8 @@ class Failover:
         lanes = 255 if self._lanes is None else self._lanes
         for k, imu in enumerate(evidence.look(delivers, self.out, now)):
             use, heard = self._values[k]
-            if not is_same or now - heard >= USE_KNOWN_FOR:
+            # Those of another system do not count for the one with an IMU out.
+            if not self._is_same or now - heard >= USE_KNOWN_FOR:
                 use = None
             imus.append(imu._replace(use=use, heard=heard, lane=bool(lanes >> k & 1)))
         reported = (
@@ -297,7 +311,7 @@ class Failover:
             and vehicle.autopilot == ARDUPILOT
             and vehicle.kind == "SCALED_IMU"
             and self._late_since is None
-            and is_same,
+            and self._is_same,
             armed=vehicle.armed,
             disarmed=vehicle.disarmed,
             monitored=self.is_alone and now - evidence.heard < SILENCE and reported,
@@ -332,7 +346,8 @@ class Failover:
             self._counted = (now, vehicle.counts["lost"], vehicle.counts["in use"])
             more = self._counted[1] - lost
             self._lost = more / max(1, more + self._counted[2] - received)
-        why = self._not_ready(view, now)
+        # An IMU that is out of use is announced by itself.
+        why = self._doubt(view, now) if self.out else self._not_ready(view, now)
         if why != self._ready[0]:
             self._ready = (why, now)
         is_late = why == MONITOR_LATE
@@ -340,14 +355,33 @@ class Failover:
             now - self._ready[1] < ANNOUNCED_AFTER and not is_late
         ):
             return
-        # An IMU that is out of use is announced by itself.
-        if why != self._told and not self.out and (view.armed or not why):
+        if self.out and not why and not self._doubted:
+            return
+        if why != self._told and (view.armed or not why):
             self._told = why
-            words = f"no failover: {why}" if why else "failover is ready"
+            self._doubted = bool(self.out and why)
+            fine = "failover acts again" if self.out else "failover is ready"
+            words = f"no failover: {why}" if why else fine
             self._say(WARNING if why else INFO, f"FDI: {words}"[:TEXT_LENGTH])
+
+    def _doubt(self, view: View, now: int) -> str:
+        """Return why no fault of any IMU would be answered now. Empty: no reason."""
+        trip = self._vehicle.sync.trip(now)
+        checks = (
+            (not self._is_same, f"failover_file is of system {self._system}"),
+            (not self.age <= LARGEST_AGE, MONITOR_LATE),
+            (self._lost > LARGEST_LOSS, "link loses messages"),
+            (self._is_slow(view, now), "IMUs come too slowly"),
+            (trip is None or trip > READY_TRIP, "link is slow"),
+            (not view.linked, "no ArduPilot that sends each IMU"),
+            (not view.monitored, "the monitor is in doubt"),
+        )
+        return next((words for holds, words in checks if holds), "")
 
     def _not_ready(self, view: View, now: int) -> str:
         """Return why a fault might go unanswered now. Empty: every fault would be answered."""
+        if doubt := self._doubt(view, now):
+            return doubt
         memories = self._state.memories
         names = [f"IMU {k + 1}" for k in range(len(memories))]
         # Suppose each IMU in turn bad, with fresh reports, in flight.
@@ -357,14 +391,7 @@ class Failover:
             bad = imu._replace(blamed=True, size=math.inf, delivers=True)
             trial = view._replace(armed=True, imus=(*imus[:k], bad, *imus[k + 1 :]))
             against.append(objection(k, memories, trial, now, self._settings))
-        trip = self._vehicle.sync.trip(now)
         checks = [
-            (not self.age <= LARGEST_AGE, MONITOR_LATE),
-            (self._lost > LARGEST_LOSS, "link loses messages"),
-            (self._is_slow(view, now), "IMUs come too slowly"),
-            (trip is None or trip > READY_TRIP, "link is slow"),
-        ]
-        checks += [
             (bool(why and imu.use), why)
             for why, imu in zip(against, view.imus, strict=True)
         ]

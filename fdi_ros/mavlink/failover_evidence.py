@@ -35,7 +35,9 @@ BREAK = 100 * MS  #: A shorter break ends no agreement, and no difference, ns.
 HEALED = NS // 2  #: Time of agreement after which an earlier size is forgotten, ns.
 SET_STANDS = 300 * MS  #: A set must stand for this time to name an IMU, ns,
 LONGEST_BREAK = 200 * MS  #: without a break longer than this, ns.
-VOTE = 2.0  #: Least error of the odd one in a set of several IMUs, in ``min_size``.
+#: Least error of the odd one in a set of several IMUs, or suspected, in ``min_size``.
+VOTE = 2.0
+SUSPECT_STANDS = NS  #: An IMU must be suspected, and the odd one, for this time, ns.
 LARGE_DIFFERENCE = (
     0.3  #: Difference from which any doubt of the monitor names the odd IMU, rad/s.
 )
@@ -56,9 +58,13 @@ WINDOWS = 4
 TURNED = 300 * MS
 #: An IMU that the monitor doubts agrees only while the difference scatters by less, rad/s.
 CALM = 0.1
-#: It agrees, like one that is out of use, only once another one has turned by this on
-#: average, rad/s: a dead gyro agrees with one at rest.
+#: It agrees, and is trusted, only once another one has turned by this on average, rad/s: a
+#: dead gyro agrees with one at rest.
 TURN_RATE = 0.1
+#: One that was bad agrees only after a turn in which its error, if in proportion to the
+#: rate, would be this multiple of ``min_size``.
+SHOWN = 3.0
+TINY = 1e-3  #: Resolution of the messages, rad/s.
 WILD_OSCILLATION = (
     1.0  #: An oscillation with this standard deviation is an error, rad/s.
 )
@@ -121,6 +127,15 @@ class Compared(NamedTuple):
     mean: Vector  #: Steady or not.
 
 
+class Wrong(NamedTuple):
+    """How an IMU was bad."""
+
+    axis: int  #: The axis that was off most.
+    size: float  #: By how much, rad/s.
+    rate: float  #: Largest rate of the others about it then, rad/s.
+    share: float  #: Largest ratio of error and rate: 1 for a gyro without scale.
+
+
 UNCOMPARED = Compared(UNKNOWN_RATES, UNKNOWN_RATES, UNKNOWN_RATES)
 
 
@@ -154,6 +169,13 @@ class RawComparison:
         self._repeating = max(FEWEST, REPEATING // interval)
         self._beside = [[UNKNOWN_RATES] * count] * count
         self._stuck = [False] * count
+        self._out: tuple[int, ...] = ()  # IMUs out of use, which may scatter
+
+    def leave_out(self, out: Sequence[int]) -> None:
+        """Take the IMUs out of use: one of them alone proves no motion."""
+        if tuple(out) != self._out:
+            self._out = tuple(out)
+            self._stuck = [False] * len(self._stuck)
 
     def feed(self, unit: int, stamp: int, rate: Vector) -> None:
         """Take a sample of an IMU, from 0: stamp in ns, rate in rad/s."""
@@ -182,28 +204,42 @@ class RawComparison:
                 rows.popleft()
 
     def _is_left_behind(self, unit: int) -> bool:
-        """Return whether other IMUs have moved since an IMU repeats one value."""
+        """Return whether other IMUs have moved since an IMU repeats one value.
+
+        Two that are out of use prove a motion only if they show the same one.
+        """
         moved = [
             k
             for k, (_, rate) in enumerate(self._last)
             if k != unit and math.dist(rate, self._beside[unit][k]) > PROVEN_MOTION
         ]
-        if len(moved) > 1:
+        in_use = [k for k in moved if k not in self._out]
+        if len(in_use) > 1:
             return True
-        return any(self._has_turned(k, self._same[unit]) for k in moved)
+        count = self._same[unit]
+        if in_use and any(self._change(in_use[0], count)):
+            return True
+        changes = [self._change(k, count) for k in moved]
+        return any(
+            math.dist(one, other) < math.hypot(*one) / 2.0
+            for one, other in combinations(changes, 2)
+        )
 
-    def _has_turned(self, unit: int, count: int) -> bool:
-        """Return whether the rate of an IMU has changed by more than its noise.
+    def _change(self, unit: int, count: int) -> Vector:
+        """Return the change of the rate of an IMU, or 0 if noise explains this, rad/s.
 
         From the first to the last `END_SAMPLES` of its last count samples.
         """
         # The oldest may be from before: IMUs are fed in turn.
         rates = np.array(list(self._recent[unit])[2 - count :])
         if len(rates) < 2 * END_SAMPLES:
-            return False
+            return 0.0, 0.0, 0.0
         noise = np.std(np.diff(rates, axis=0)) / math.sqrt(END_SAMPLES)
         change = rates[-END_SAMPLES:].mean(axis=0) - rates[:END_SAMPLES].mean(axis=0)
-        return bool(np.linalg.norm(change) > PROVEN_MOTION + NOISE * noise)
+        if np.linalg.norm(change) <= PROVEN_MOTION + NOISE * noise:
+            return 0.0, 0.0, 0.0
+        x, y, z = change.tolist()
+        return x, y, z
 
     def _rates(self, unit: int) -> list[Vector]:
         """Return the rates of an IMU within `AVERAGED`, rad/s."""
@@ -228,10 +264,21 @@ class RawComparison:
         x, y, z = (share * abs(_steady(pair)) for pair in zip(*gains, strict=True))
         return x, y, z
 
-    def turn(self, unit: int) -> float:
+    def turn(self, unit: int) -> Vector:
         """Return the mean rate of an IMU within `AVERAGED`, rad/s: that of a turn."""
-        rates = self._rates(unit)
-        return math.hypot(*np.mean(rates, axis=0)) if rates else math.nan
+        x, y, z = np.mean(self._rates(unit) or [UNKNOWN_RATES], axis=0).tolist()
+        return x, y, z
+
+    def shake(self, unit: int) -> Vector:
+        """Return the standard deviation of the rate of an IMU within `AVERAGED`, rad/s."""
+        x, y, z = np.std(self._rates(unit) or [UNKNOWN_RATES], axis=0).tolist()
+        return x, y, z
+
+    def peaks(self, unit: int) -> Vector:
+        """Return the largest rate of an IMU within twice `AVERAGED`, by axis, rad/s."""
+        rates = list(self._recent[unit])[-2 * self._averaged :] or [UNKNOWN_RATES]
+        x, y, z = np.abs(rates).max(axis=0).tolist()
+        return x, y, z
 
     def is_stuck(self, unit: int) -> bool:
         """Return whether an IMU has repeated one value while another one moved."""
@@ -391,9 +438,14 @@ class Evidence:
         self._named_at = [0] * count
         self._outdated: list[set[int]] = [set()] * count
         self._together: int | None = None  # since when all IMUs agree, ns
-        # Since when each IMU agrees with another, ns, and agrees with one that has turned.
+        # Since when each IMU agrees with another, ns, and has agreed in a turn that shows
+        # an error in proportion to the rate.
         self._agreed: list[int | None] = [None] * count
         self._turned: list[int | None] = [None] * count
+        # How each IMU was bad when it last was.
+        self._wrong: list[Wrong | None] = [None] * count
+        # Whether each IMU has agreed in a turn since it was apart from all others.
+        self._has_shown = [False] * count
         self._agreed_at = [0] * count  # when each IMU last agreed, ns
         self._odd = -1  # the IMU that is bad without a name, or -1
         self._odd_since = 0
@@ -424,6 +476,7 @@ class Evidence:
         if now - self.heard >= STATES_KNOWN_FOR:
             self._states = [()] * len(delivers)
         units = [k for k, does in enumerate(delivers) if does]
+        self.raw.leave_out(out)
         self._compare(units, now)
         self._note_trust(units, now)
         odd, axes, lasting = self._odd_one(units, now)
@@ -457,16 +510,22 @@ class Evidence:
             self._note_names(k, agreed, now)
             if not self._is_odd(k, units):
                 accused = accused - self._outdated[k]
+            blamed = any(vector[axis] >= self._min_size for axis in accused)
+            if k in out or blamed:
+                self._note_wrong(k, partners[k], nearest[k])
+            elif agreed is not None and now - agreed >= HEALED:
+                self._wrong[k] = None
             is_unknown = not self._states[k] and k != odd
             stuck = self.raw.is_stuck(k)
             imus.append(
                 Imu(
                     named=None if is_unknown else bool(faulty or k == odd),
-                    blamed=any(vector[axis] >= self._min_size for axis in accused),
+                    blamed=blamed,
                     ok=set(self._states[k]) == {ChannelState.OK} and not stuck,
                     delivers=delivers[k],
                     stuck=stuck,
                     size=max(vector),
+                    least=self._least(k, units),
                     agreed=agreed,
                     judged=any(state not in UNJUDGED for state in self._states[k]),
                 )
@@ -521,11 +580,18 @@ class Evidence:
                 self._doubted[k] = doubts
                 self._doubted_at[k] = now
             own = [max(self._pairs[k, j].apart) for j in units if j != k]
+            is_turning = (
+                not self._wrong[k] and math.hypot(*self.raw.turn(k)) >= TURN_RATE
+            )
+            if self._turned[k] is not None or (self._together and is_turning):
+                self._has_shown[k] = True
             if self._together is not None and now - self._together >= TRUSTED:
                 is_old = now - self._doubted_at[k] >= REFUTING
-                self._refuted[k] = doubts if is_old else self._refuted[k] or set()
+                if self._has_shown[k]:
+                    self._refuted[k] = doubts if is_old else self._refuted[k] or set()
             elif all(size >= self._min_size for size in own):
                 self._refuted[k] = None
+                self._has_shown[k] = False
 
     def _note_agreement(
         self, unit: int, partners: Sequence[int], is_out: bool, now: int
@@ -542,10 +608,47 @@ class Evidence:
             self._agreed[unit] = self._agreed[unit] or now
             # A mean that is no steady error yet may be the begin or end of a turn.
             alike = [k for k in agreeing if self._agree(unit, k, doubted=True)]
-            if any(self.raw.turn(k) >= TURN_RATE for k in alike):
+            if any(self._shows(unit, k) for k in alike):
                 self._turned[unit] = self._turned[unit] or now
         must_turn = doubted or is_out
         return self._turned[unit] if must_turn else self._agreed[unit]
+
+    def _least(self, unit: int, units: Sequence[int]) -> float:
+        """Return the difference of an IMU to the nearest of all others, rad/s."""
+        pairs = [(unit, k) for k in units if k != unit and unit in units]
+        sizes = [max(self._pairs[pair].apart) for pair in pairs]
+        return min((size for size in sizes if size >= 0.0), default=math.nan)
+
+    def _note_wrong(self, unit: int, partners: Sequence[int], apart: Vector) -> None:
+        """Note the axis on which a bad IMU is off most, and its error as a share."""
+        size, axis = max((size, axis) for axis, size in enumerate(apart))
+        if not size >= self._min_size:
+            return
+        # Of a gyro without scale the error is this rate at most.
+        rate = max(self.raw.peaks(k)[axis] for k in partners)
+        found = Wrong(axis, size, rate, size / max(rate, TINY))
+        before = self._wrong[unit]
+        if before is not None and axis == before.axis:
+            share = max(found.share, before.share)
+            rate = max(rate, before.rate)
+            self._wrong[unit] = Wrong(axis, max(size, before.size), rate, share)
+        elif before is None or size > before.size:
+            self._wrong[unit] = found
+
+    def _shows(self, unit: int, other: int) -> bool:
+        """Return whether a turn shows the error of an IMU that agrees with another.
+
+        A bias was apart at rest too. A gyro that has lost its scale on one axis shows that
+        only in turns about this axis.
+        """
+        turn = self.raw.turn(other)
+        wrong = self._wrong[unit]
+        if wrong is None:
+            return math.hypot(*turn) >= TURN_RATE
+        # What scatters does not agree from `CALM` on: twice that is shown by a shake.
+        shake = self.raw.shake(other)[wrong.axis] / (2.0 * CALM)
+        shown = max(abs(turn[wrong.axis]), SHOWN * self._min_size * shake)
+        return shown >= min(wrong.rate, SHOWN * self._min_size / wrong.share)
 
     def _note_names(self, unit: int, agreed: int | None, now: int) -> None:
         """Note which axes were named before the IMU has agreed for long."""
@@ -628,23 +731,34 @@ class Evidence:
         `NOBODY` if there is none.
 
         Of three IMUs it is the one that is off by `CLEAR_DIFFERENCE` while the two others
-        agree, or by less if the monitor doubts it too. Otherwise it is the only IMU with a
-        set. If one of two others is not trusted, a set proves nothing: two IMUs that
-        fail alike put the healthy third one into a set.
+        agree, or by less if the monitor doubts it or it is stuck. Otherwise it is the
+        only IMU with a set. If one of two others is not trusted, a set proves nothing:
+        two IMUs that fail alike put the healthy third one into a set.
         """
         for k in units:
             if not self._is_odd(k, units):
                 continue
             if axes := self._clear_axes(k, units, now):
                 return k, axes, 0
-            sizes = [self._pairs[k, j].apart for j in units if j != k]
+            others = [j for j in units if j != k]
+            sizes = [self._pairs[k, j].apart for j in others]
+            least = [min(one, other) for one, other in zip(*sizes, strict=True)]
+            steps = [self.raw.steps(j, self.raw.fewest) for j in others]
+            vote = VOTE * self._min_size
+            checks = (
+                (range(3) if self.raw.is_stuck(k) else (), self._min_size, SET_STANDS),
+                (self._axes(k, ChannelState.AMBIGUOUS), vote, SET_STANDS),
+            )
+            for doubted, size, stands in checks:
+                if axes := {axis for axis in doubted if least[axis] >= size}:
+                    return k, axes, stands
             axes = {
                 axis
-                for axis in self._axes(k, ChannelState.AMBIGUOUS)
-                if min(size[axis] for size in sizes) >= VOTE * self._min_size
+                for axis in self._axes(k, ChannelState.SUSPECT)
+                if least[axis] >= vote + max(step[axis] for step in steps)
             }
             if axes:
-                return k, axes, SET_STANDS
+                return k, axes, SUSPECT_STANDS
         sets = {k: self._axes(k, ChannelState.AMBIGUOUS) for k in units}
         found = [(k, axes, SET_STANDS) for k, axes in sets.items() if axes]
         if len(found) != 1:

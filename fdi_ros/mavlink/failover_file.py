@@ -30,6 +30,13 @@ class Saved(NamedTuple):
     #: Time of the autopilot's start after that of this computer, s. NaN: unknown.
     after: float = math.nan
     computer: str = ""  #: Identity of that start of this computer. Empty: unknown.
+    #: Of those out of use, the ones that were so when the autopilot started.
+    without_notch: tuple[int, ...] = ()
+
+    @property
+    def lasting(self) -> tuple[object, ...]:
+        """What does not change from tick to tick."""
+        return self.system, self.out, self.without_notch
 
 
 class FailoverFile:
@@ -63,7 +70,7 @@ class FailoverFile:
             self.trouble = "" if cause is None else str(cause)
             if cause is not None:
                 self._retry = now + 1_000_000_000
-        is_due = self.trouble or saved[:2] != self.written[:2]
+        is_due = self.trouble or saved.lasting != self.written.lasting
         if is_due and self._job is None and now >= self._retry:
             self._job = self._thread.submit(self._write, saved)
         return self.trouble if self.trouble != before else ""
@@ -71,14 +78,15 @@ class FailoverFile:
     def close(self) -> None:
         """Write the last content, if that has not been done. Raise `ConfigError` if it fails."""
         self._thread.shutdown()
-        if self._wanted[:2] != self.written[:2]:
+        if self._wanted.lasting != self.written.lasting:
             self._write(self._wanted)
 
     def _read(self, count: int) -> Saved:
         try:
             found = json.loads(read_trusted(self._path, LARGEST_FILE))
             out = tuple(int(imu) - 1 for imu in found["out_of_use"])
-            if not set(out) <= set(range(count)):
+            bare = tuple(int(imu) - 1 for imu in found.get("without_notch", ()))
+            if not set(out) <= set(range(count)) or not set(bare) <= set(out):
                 raise ValueError
             return Saved(
                 system=int(found["system_id"]),
@@ -86,6 +94,7 @@ class FailoverFile:
                 booted=float(found.get("autopilot_booted", 0.0)),
                 after=float(found.get("after_computer", math.nan)),
                 computer=str(found.get("computer_boot", "")),
+                without_notch=bare,
             )
         except FileNotFoundError:
             return Saved()
@@ -110,6 +119,7 @@ class FailoverFile:
             "system_id": saved.system,
             "out_of_use": [imu + 1 for imu in saved.out],
             "autopilot_booted": round(saved.booted, 1),
+            "without_notch": [imu + 1 for imu in saved.without_notch],
         }
         if saved.computer:
             content["after_computer"] = round(saved.after, 1)

@@ -28,13 +28,13 @@ Definitions
 
 Rules, in this order at each tick
     1. A held IMU goes back in use if the operator asks; if every other IMU is dead or out
-       of use; or if the IMU has not been apart for a pause, counted from a turn: at rest
-       a gyro that has lost its scale agrees too. The pause is `FIRST_PAUSE`, doubled each time
-       the IMU is taken out in one flight. In flight the last case needs a live monitor,
-       and an IMU that the monitor finds OK goes back at once if all that are in use are
-       bad. On the ground the IMU stays out until the monitor finds it OK. An IMU that
-       was out when the autopilot started has no notch filters: only the operator or rule
-       4 puts it back.
+       of use; or if the IMU has not been apart for a pause, counted from a turn that would
+       show its error: at rest a gyro that has lost its scale agrees too. The pause is
+       `FIRST_PAUSE`, doubled each time the IMU is taken out in one flight. In flight the
+       last case needs a live monitor, and if all that are in use are bad, an IMU goes back
+       at once that the monitor finds OK, or soon if it is off by a `LESSER`-th. On the
+       ground the IMU stays out until the monitor finds it OK. An IMU that was out when the
+       autopilot started has no notch filters: only the operator or rule 4 puts it back.
     2. In flight, the worst bad IMU to which `objection` has nothing becomes held. At
        most ``limit`` IMUs are ours, without a limit all but one.
     3. Orders are sent until the autopilot reports the wanted state. An order to take an
@@ -42,8 +42,8 @@ Rules, in this order at each tick
        other IMU whose "in use" was reported within `FRESH`.
     4. If the autopilot reports no IMU in use, all of ours go back.
 
-No bad IMU goes back to make room for a worse one: while an IMU is out, its EKF lane
-runs on the first IMU in use, and would follow the one that came back.
+No bad IMU goes back to make room for a worse one that is not the last: while an IMU is
+out, its EKF lane runs on the first IMU in use, and would follow the one that came back.
 
 An IMU that somebody else has set is left alone until the vehicle is disarmed.
 """
@@ -77,6 +77,8 @@ REPEAT = 10 * NS  #: Time between two announcements of a lasting danger, ns.
 #: Angle by which an EKF lane is lost, rad: what its IMU turned too much or too little. In
 #: ArduCopter's simulation lanes recover from 0.4 rad within 10 s, and never from 3 rad.
 LOST_LANE = 1.5
+#: An IMU off by this part of what the last ones in use are off by goes back beside them.
+LESSER = 4.0
 LANE_RECOVERY = 10.0  #: Time constant with which a lane recovers from less, s.
 LONG_AGO = -(10**18)  #: A time before all others, ns.
 
@@ -135,8 +137,11 @@ class Imu(NamedTuple):
     lane: bool = True  #: The autopilot has an EKF lane for it, as far as is known.
     size: float = float("nan")
     """Largest raw difference to the nearest IMU of late, rad/s. NaN: unknown."""
+    least: float = float("nan")
+    """Present one to the nearest of all others, out of use or not, rad/s. NaN: unknown."""
     #: Not apart from a sound IMU since this time. None: apart, stuck or unknown. If the
-    #: monitor doubts it, or it is out of use, from the time at which the sound one turned.
+    #: monitor doubts it, or it is out of use, from the time of a turn that would show its
+    #: error.
     agreed: int | None = None
 
 
@@ -169,6 +174,7 @@ class Memory:
     bad_since: int | None = None
     apart_since: int | None = None
     dead_since: int | None = None  #: Stuck, or without samples, since this time.
+    lesser_since: int | None = None  #: Off by less than those in use, by `LESSER`.
     against_since: int | None = None  #: Since when reports contradict `seen`, ns.
     lane_angle: float = 0.0  #: Angle by which its EKF lane was misled, rad.
 
@@ -200,7 +206,10 @@ class PolicyState(NamedTuple):
 
     @classmethod
     def begin(
-        cls, count: int, ours: Sequence[int] = (), rebooted: bool = False
+        cls,
+        count: int,
+        ours: Sequence[int] = (),
+        without_notch: Sequence[int] = (),
     ) -> PolicyState:
         """Return the state at a start of the companion.
 
@@ -210,13 +219,16 @@ class PolicyState(NamedTuple):
             Number of IMUs.
         ours
             IMUs, from 0, that the last run left out of use.
-        rebooted
-            The autopilot may have started since then.
+        without_notch
+            Those of them that were out of use when the autopilot started.
         """
-        # Reported out, as far as known: an order may still be under way.
-        seen = None if rebooted else False
-        left = Memory(ours=True, held=True, seen=seen, without_notch=rebooted)
-        return cls(tuple(left if k in ours else Memory() for k in range(count)))
+        memories = tuple(Memory() for _ in range(count))
+        for k in ours:
+            # Reported out, as far as known: an order may still be under way.
+            memories[k].ours = memories[k].held = True
+            memories[k].seen = False
+            memories[k].without_notch = k in without_notch
+        return cls(memories)
 
 
 class Decision(NamedTuple):
@@ -310,7 +322,8 @@ def decide(
     found = _conditions(memories, view, now) if view.linked else []
     for key, condition in found:
         is_fine = condition is Condition.FINE
-        if is_fine and not view.imus[key].size < settings.min_size:
+        is_near = is_fine and view.imus[key].size < settings.min_size
+        if is_fine and not (is_near and memories[key].seen):
             # Off, but not for long, or nobody is the odd one, or unknown.
             continue
         if condition is Condition.REDUNDANT and not _is_redundant(memories, view):
@@ -428,12 +441,17 @@ def _release(
         for memory, imu in pairs
     )
     only_bad = all(memory.ours or is_bad(imu, settings) for memory, imu in pairs)
+    in_use = [imu.size for memory, imu in pairs if not memory.ours]
+    lesser = min(in_use, default=0.0) / LESSER
     for memory, imu in pairs:
         pause = min(FIRST_PAUSE << max(0, memory.taken - 1), LONGEST_PAUSE)
         agrees = _has_stood(imu.agreed, pause, now)
         may = view.monitored if view.armed else imu.ok
         heals = agrees and may and is_alive(imu)
-        is_better = only_bad and view.monitored and imu.ok and is_alive(imu)
+        is_lesser = only_bad and imu.least < lesser
+        memory.lesser_since = (memory.lesser_since or now) if is_lesser else None
+        is_less = imu.ok or _has_stood(memory.lesser_since, REACTION, now)
+        is_better = only_bad and view.monitored and is_less and is_alive(imu)
         wanted = (heals or is_better) and not memory.without_notch
         if memory.held and (view.restore or none_left or wanted):
             memory.held = False

@@ -27,7 +27,7 @@ CONDITION_WORDS = {
     Condition.NOT_OK: Words(WARNING, "stays out, monitor finds it not OK"),
     Condition.UNTURNED: Words(WARNING, "stays out until turned by hand"),
     Condition.REBOOT: Words(CRITICAL, "no notch: set INS_USE{} 1 and reboot"),
-    Condition.STUCK_OUT: Words(WARNING, "not back in use: no answer"),
+    Condition.STUCK_OUT: Words(WARNING, "not back in use, though asked"),
     Condition.LEFT_ALONE: Words(WARNING, "left alone until disarmed"),
     Condition.UNUSED: Words(WARNING, "not in use, not by failover"),
     Condition.APART: Words(WARNING, "differs from the others"),

@@ -135,6 +135,8 @@ class Vehicle:
         self.disarmed = 0  #: For how long all heartbeats have reported "disarmed", ns.
         #: Number of conversations begun. Parameters reported before may have changed.
         self.begun = 0
+        #: Stay with an autopilot that has sent gyros, also while it is silent.
+        self.keeps_system = False
         self.peer: Any = None
         self.behind = 0.0  #: Age of the last signature that was too old, s.
         self._behind_from: Any = None
@@ -308,7 +310,9 @@ class Vehicle:
     def _may_change_to(self, system: int, beats: bool, number: int, now: int) -> bool:
         """Return whether another autopilot may come into use: the present one is lost or silent."""
         is_gone = self.system is None or self._lost
-        if self.settings.system or not system or not (is_gone or not self.gives_gyros):
+        if self.settings.system or not system:
+            return False
+        if self.gives_gyros and (self.keeps_system or not is_gone):
             return False
         if number in IMU_MESSAGES:
             return now - self.others.get(system, -LOST_AFTER) < LOST_AFTER

@@ -156,6 +156,10 @@ class Flight:
                 if j != k and not self.stuck[j]
             ]
             size = min(others, default=math.nan)
+            least = min(
+                (abs(self.error[k] - e) for j, e in enumerate(self.error) if j != k),
+                default=math.nan,
+            )
             agrees = size < self.settings.min_size and not self.stuck[k]
             self.agreed[k] = (self.agreed[k] or self.now) if agrees else None
             imus.append(
@@ -170,6 +174,7 @@ class Flight:
                     delivers=self.delivers[k],
                     stuck=self.stuck[k],
                     size=size,
+                    least=least,
                     agreed=self.agreed[k],
                 )
             )

@@ -124,6 +124,35 @@ def test_two_gyros_that_stand_still_do_not_outvote_a_sound_one(
     assert 2 not in watched.blamed(8.0)
 
 
+def test_two_that_die_in_one_hover_do_not_outvote_the_third() -> None:
+    """The first is out; at rest it agrees with all others, and the second dies alike."""
+    watched = Watched()
+    dead = [lambda rate: 0.01 * rate] * 2
+    watched.gyros[0] = dead[0]
+    watched.states[:3] = [FAULTY] * 3
+    watched.run(1.0)
+    watched.out = [0]
+    turning = watched.rate
+    watched.rate = lambda t: np.array([0.015 * math.sin(2.0 * t), 0.01, 0.0])
+    watched.run(4.0)
+    watched.gyros[1] = dead[1]
+    watched.run(2.0)
+    watched.rate = turning
+    assert 2 not in watched.blamed(3.0)
+
+
+def test_two_that_are_dead_from_the_start_do_not_outvote_the_third() -> None:
+    """All agree at rest. Only a turn shows that two gyros measure."""
+    watched = Watched()
+    watched.evidence = Evidence(3, STEP, min_size=0.03)
+    turning = watched.rate
+    watched.rate = lambda t: np.zeros(3)
+    watched.gyros[:2] = [lambda rate: watched.random.normal(0.0, 0.002, 3)] * 2
+    watched.run(5.0)
+    watched.rate = turning
+    assert 2 not in watched.blamed(3.0)
+
+
 @pytest.mark.parametrize("state", [SUSPECT, AMBIGUOUS, STALE])
 def test_two_that_the_monitor_doubts_do_not_outvote_one_that_it_does_not(
     state: int,

@@ -7,6 +7,7 @@ import copy
 import copyreg
 import errno
 import json
+import math
 import os
 import struct
 import threading
@@ -293,7 +294,18 @@ def test_a_name_without_a_raw_difference_does_nothing(
     assert not flying.autopilots[0].sets
 
 
-@pytest.mark.parametrize("state", [OK, SUSPECT, UNCHECKED])
+def test_the_odd_one_that_the_monitor_suspects_for_a_second_is_out(
+    flying: Monitored,
+) -> None:
+    """In a simulated flight 0.3 rad/s stayed SUSPECT, and in use, for 7 s."""
+    flying.fault(1, 0.1, (OK, SUSPECT, OK), seconds=0.9)
+    flying.fault(1, 0.1, (OK, OK, OK), seconds=0.4)
+    flying.fault(1, 0.1, (OK, SUSPECT, OK), seconds=0.9)
+    assert not flying.autopilots[0].sets
+    assert flying.run(0.6).in_use == [False, True, True]
+
+
+@pytest.mark.parametrize("state", [OK, UNCHECKED])
 def test_a_raw_difference_without_the_monitor_does_nothing(
     flying: Monitored, state: int
 ) -> None:
@@ -686,6 +698,106 @@ def test_a_slow_disk_holds_up_no_order(
     flying.failover.close()
 
 
+class Moved:
+    """Motion of three IMUs that a test changes in flight, with noise of 2 mrad/s."""
+
+    def __init__(self, *rate: float, noise: float = 0.002) -> None:
+        self.rate = np.array(rate)
+        #: Factors by IMU and axis, and standard deviations by IMU that replace 2 mrad/s.
+        self.scale = np.ones((3, 3))
+        self.noise = np.full((3, 1), noise)
+        self.random = np.random.default_rng(1)
+
+    def __call__(self, t: float) -> np.ndarray:
+        wobble = self.rate * (1.0 + 0.3 * math.sin(3.0 * t))
+        return wobble * self.scale + self.noise * self.random.normal(size=(3, 3))
+
+
+def moving(path: Path, *rate: float, noise: float = 0.002) -> tuple[Monitored, Moved]:
+    """Return an armed flight and its motion."""
+    moved = Moved(*rate, noise=noise)
+    talk = Monitored(path, Autopilot("ardupilot", motion=moved)).run(10.0)
+    talk.autopilots[0].armed = True
+    return talk.run(3.0), moved
+
+
+def test_a_dead_axis_stays_out_until_a_turn_about_it(tmp_path: Path) -> None:
+    """Two seconds of yaw prove nothing about roll."""
+    talk, moved = moving(tmp_path, 1.0, 0.2, 0.1)
+    moved.scale[0, 0] = 0.0
+    talk.fault(1, 0.0, (FAULTY, OK, OK), seconds=2.0)
+    assert talk.in_use == [False, True, True]
+    moved.rate = np.array([0.04, 0.2, 0.5])
+    assert talk.heal(1, 8.0).in_use == [False, True, True]
+    moved.scale[0, 0] = 1.0
+    assert talk.run(5.0).in_use == [False, True, True]
+    moved.rate = np.array([0.3, 0.2, 0.1])
+    assert talk.run(4.0).in_use == [True, True, True]
+
+
+def test_a_lost_part_of_the_scale_stays_out_in_slow_turns(tmp_path: Path) -> None:
+    talk, moved = moving(tmp_path, 2.0, 0.1, 0.1)
+    moved.scale[0, 0] = 0.7
+    talk.fault(1, 0.0, (FAULTY, OK, OK), seconds=2.0)
+    assert talk.in_use == [False, True, True]
+    moved.rate = np.array([0.07, 0.1, 0.1])
+    assert talk.heal(1, 8.0).in_use == [False, True, True]
+
+
+def test_a_short_error_in_a_hover_goes_back_there(tmp_path: Path) -> None:
+    """It was no share of rates this small, so a turn would show no more."""
+    talk, _ = moving(tmp_path, 0.05, 0.03, 0.02)
+    talk.fault(2, 1.0, seconds=1.0)
+    assert talk.in_use == [True, False, True]
+    assert talk.heal(2, 4.0).in_use == [True] * 3
+
+
+@pytest.mark.parametrize("bad", [(2,), (2, 3)])
+def test_bad_imus_that_scatter_beside_one_at_rest_stay_out(
+    tmp_path: Path, bad: tuple[int, ...]
+) -> None:
+    """A quiet gyro at rest repeats zero, in whole mrad/s: rest is no death."""
+    talk, moved = moving(tmp_path, 0.5, 0.3, 0.1, noise=0.0003)
+    for imu in bad:
+        moved.noise[imu - 1] = 0.1
+        talk.fault(imu, (1.0, 0.0, 0.0), (FAULTY, OK, OK), seconds=2.0)
+    expected = [imu not in bad for imu in (1, 2, 3)]
+    assert talk.in_use == expected
+    moved.rate = np.zeros(3)
+    talk.run(30.0)
+    assert not any(value for *_, value in talk.autopilots[0].sets)
+    assert talk.in_use == expected
+    assert not any("alive" in text or "lane" in text for text in talk.texts)
+
+
+@pytest.mark.parametrize("state", [OK, STALE])
+def test_a_frozen_imu_is_out_where_two_others_agree(tmp_path: Path, state: int) -> None:
+    """It repeats its value while others move, and differs: a monitor need not name it."""
+    talk, moved = moving(tmp_path, 0.02, 0.25, 0.05)
+    moved.scale[0] = 0.0
+    moved.noise[0] = 0.0
+    talk.states[:3] = [state] * 3
+    assert talk.run(1.5).in_use == [False, True, True]
+
+
+def test_a_lesser_error_is_better_than_none_sound(flying: Monitored) -> None:
+    """Two are out for 0.07 rad/s each, then the last one is off by 1 rad/s."""
+    flying.fault(1, 0.07, seconds=4.0)
+    flying.fault(2, -0.07, seconds=4.0)
+    assert flying.in_use == [False, False, True]
+    flying.fault(3, 1.0, seconds=3.0)
+    assert flying.in_use == [True, True, True]
+    assert flying.run(8.0).in_use == [True, True, True]
+
+
+def test_a_step_at_rest_says_nothing_of_the_others(tmp_path: Path) -> None:
+    """As in the check list of the docs: an offset of IMU 2, armed on the ground."""
+    talk, _ = moving(tmp_path, 0.0, 0.0, 0.0, noise=0.0003)
+    talk.fault(2, 0.3, seconds=10.0)
+    assert talk.in_use == [True, False, True]
+    assert not any("IMU 3" in text or "IMU 1" in text for text in talk.texts)
+
+
 # On the ground ---------------------------------------------------------------------------
 
 
@@ -775,6 +887,32 @@ def test_a_boot_without_notch_filters_is_not_hidden(
     again.run(5.0)
     autopilot.reboot(again.now)
     assert again.run(12.0).failover.status(again.now)[1] == "ready"
+
+
+def test_a_node_that_starts_anew_knows_who_has_no_notch_filter(
+    flying: Monitored, tmp_path: Path
+) -> None:
+    """The autopilot was started with IMU 2 out of use, then IMU 1 goes out, too."""
+    autopilot = flying.autopilots[0]
+    flying.clocks = lambda: Clocks(UTC + flying.now / NS, flying.now / NS, "a")
+    flying.fault(2, 0.3, seconds=1.0)
+    autopilot.armed = False
+    flying.run(3.0)
+    autopilot.reboot(flying.now)
+    flying.run(6.0)
+    assert not any("IMU 2 in use" in text for text in flying.texts)
+    autopilot.armed = True
+    flying.heal(2, 8.0)
+    flying.fault(1, 0.5, seconds=1.0)
+    assert flying.in_use == [False, False, True]
+    flying.failover.close()
+    boot, start = autopilot.boot, autopilot.start
+    again = Monitored(tmp_path, autopilot)
+    again.now, autopilot.boot, autopilot.start = flying.now, boot, start
+    again.clocks = lambda: Clocks(UTC + again.now / NS, again.now / NS, "a")
+    again.states = list(flying.states)
+    again.run(12.0)
+    assert again.in_use == [False, False, True], "no IMU without a notch filter"
 
 
 @pytest.mark.parametrize("together", [True, False])
@@ -933,21 +1071,41 @@ def test_a_monitor_that_was_silent_is_believed_after_its_next_report(
     assert flying.run(0.5).autopilots[0].sets
 
 
-def test_another_system_says_nothing_of_the_imu_that_is_out(tmp_path: Path) -> None:
-    """The one with an IMU out falls silent, another is heard, then the first again."""
+def test_another_vehicle_on_the_link_is_left_aside(tmp_path: Path) -> None:
+    """The first one falls silent while another one sends gyros, and is heard again."""
     first = Autopilot("ardupilot", armed=True)
     second = Autopilot("ardupilot", system=2, armed=True, loss=1.0)
     talk = Monitored(tmp_path, first, second).run(10.0)
-    talk.fault(1, 0.3, seconds=5.0)
     first.loss, second.loss = 1.0, 0.0
-    talk.run(15.0)
-    assert talk.vehicle.system == 2
-    assert kept(talk, tmp_path) == (1, [1])
+    second.bias[1] = (0.0, 1.0, 0.0)
+    talk.run(8.0)
+    assert talk.vehicle.system == 1
+    first.loss = 0.0
+    talk.run(8.0)
+    talk.fault(1, 0.3, seconds=2.0)
+    assert first.sets[0][1] == "INS_USE"
     assert not second.sets
-    first.loss, second.loss = 0.0, 1.0
-    talk.heal(1, 20.0)
-    assert first.flies_with == 0
-    assert not second.sets
+
+
+def test_a_file_of_another_vehicle_is_announced(tmp_path: Path) -> None:
+    file = tmp_path / "out.json"
+    file.write_text('{"system_id": 7, "out_of_use": [2]}')
+    autopilot = Autopilot("ardupilot")
+    talk = Monitored(tmp_path, autopilot).run(10.0)
+    autopilot.armed = True
+    talk.fault(1, 0.5, seconds=6.0)
+    assert not autopilot.sets
+    assert talk.texts == ["no failover: failover_file is of system 7"]
+    assert reason(talk) == "out of use: IMU 2 of system 7; no failover of system 1"
+
+
+def test_a_late_monitor_is_announced_while_an_imu_is_out(flying: Monitored) -> None:
+    flying.fault(2, 0.3, seconds=2.0)
+    flying.failover.age = 1.5
+    flying.run(1.0)
+    assert flying.texts[-1] == "no failover: the monitor is late"
+    flying.failover.age = 0.02
+    assert flying.run(5.0).texts[-1] == "failover acts again"
 
 
 # Words, file, recordings -----------------------------------------------------------------
