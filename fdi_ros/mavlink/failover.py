@@ -57,7 +57,8 @@ ANNOUNCED_AFTER = (
     3 * NS
 )  #: Readiness must have changed for this time to be announced, ns.
 BOOT_STEP = 3 * NS  #: A boot time that grows by more is another boot, ns,
-BACKLOG = 10 * NS  #: if the autopilot's time has gone back, or after this time, ns.
+#: if the autopilot's time has gone back, or after this time over a link that is quick, ns.
+BACKLOG = 10 * NS
 SAME_BOOT = 10.0  #: Largest difference of two times of one start of the autopilot, s.
 #: Two starts within this time are those of one power supply, s.
 POWERED_TOGETHER = 60.0
@@ -232,7 +233,8 @@ class Failover:
         elif self._booted is not None and booted - self._booted > BOOT_STEP:
             # A link that was blocked also delivers late what it has kept.
             self._late_since = self._late_since or now
-            if restarts == self._restarts and now - self._late_since < BACKLOG:
+            is_long = now - self._late_since >= BACKLOG and self._vehicle.sync.trip(now)
+            if restarts == self._restarts and not is_long:
                 return
             self._boots += 1
             self._forget()
@@ -369,7 +371,7 @@ class Failover:
         trip = self._vehicle.sync.trip(now)
         checks = (
             (not self._is_same, f"failover_file is of system {self._system}"),
-            (not self.age <= LARGEST_AGE, MONITOR_LATE),
+            (not abs(self.age) <= LARGEST_AGE, MONITOR_LATE),
             (self._lost > LARGEST_LOSS, "link loses messages"),
             (self._is_slow(view, now), "IMUs come too slowly"),
             (trip is None or trip > READY_TRIP, "link is slow"),

@@ -74,6 +74,7 @@ REACTION = NS  #: A bad IMU in use is announced after this time, ns.
 UNNAMED = 5 * NS  #: An IMU that is apart, but not named, is announced after this, ns.
 ACQUAINTED = 5 * NS  #: Agreement needed once before failover is ready, ns.
 REPEAT = 10 * NS  #: Time between two announcements of a lasting danger, ns.
+SPACED = NS  #: Least time between two announcements that are not urgent, ns.
 #: Angle by which an EKF lane is lost, rad: what its IMU turned too much or too little. In
 #: ArduCopter's simulation lanes recover from 0.4 rad within 10 s, and never from 3 rad.
 LOST_LANE = 1.5
@@ -106,6 +107,8 @@ class Condition(Enum):
     LAST_LANE = "one EKF lane, or none, is not lost, and others are, armed"
 
 
+#: Announced at once. The others change at most every `SPACED` for one IMU or the vehicle.
+URGENT = {Condition.DANGER, Condition.OUT, Condition.ALONE, Condition.LAST_IMU}
 #: Announced every `REPEAT`.
 REPEATED = {
     Condition.DANGER,
@@ -329,9 +332,11 @@ def decide(
         if condition is Condition.REDUNDANT and not _is_redundant(memories, view):
             continue
         usual = Condition.REDUNDANT if key == VEHICLE else Condition.FINE
-        last = announced.get(key, Announced(usual, now))
+        last = announced.get(key, Announced(usual, LONG_AGO))
+        waits = 0 if condition in URGENT else SPACED
+        is_changed = condition != last.condition and now - last.at >= waits
         is_late = condition in REPEATED and now - last.at >= REPEAT
-        if condition != last.condition or is_late:
+        if is_changed or is_late:
             announced[key] = Announced(condition, now)
             words.append((key, condition))
     doubtful = any(
@@ -400,6 +405,8 @@ def _hear(memory: Memory, use: bool, heard: int) -> None:
         # order was lost.
         by_others = use and changed and memory.out_sent != LONG_AGO
     is_over = use and settled
+    if memory.seen is False and use:
+        memory.apart_since = None
     memory.seen = use
     if by_others or (memory.ours and is_over):
         memory.ours = memory.held = False

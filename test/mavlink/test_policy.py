@@ -29,9 +29,9 @@ START = 1000 * 1000 * MS
 OUT = Memory(ours=True, held=True, seen=False, out_sent=START, tries=1, taken=1)
 
 
-def tick(memory, now, *, use, agreed=None):
+def tick(memory, now, *, use, agreed=None, size=0.0):
     """Memory of the first of three IMUs after one tick; its INS_USE is reported now."""
-    first = Imu(use, now, delivers=True, ok=True, size=0.0, agreed=agreed)
+    first = Imu(use, now, delivers=True, ok=True, size=size, agreed=agreed)
     others = (Imu(True, now, delivers=True, ok=True, size=0.0, agreed=START),) * 2
     view = View((first, *others), linked=True, armed=True, monitored=True)
     state = PolicyState(
@@ -100,6 +100,31 @@ def test_on_the_ground_an_imu_stays_out_until_it_has_agreed_while_turning():
     decision = on_the_ground(OUT, START + 60 * 1000 * MS, turned=False)
     assert not decision.orders
     assert (0, Condition.UNTURNED) in decision.words
+
+
+def test_the_time_apart_counts_from_the_return_of_an_imu():
+    """While it was out of use, its difference mattered to nobody."""
+    now = START + 10_000 * MS
+    back = replace(OUT, held=False, back_sent=now - 100 * MS, apart_since=START)
+    assert tick(back, now, use=True, size=0.5).apart_since == now
+    assert tick(back, now, use=False, size=0.5).apart_since == START
+
+
+def test_a_monitor_that_flickers_does_not_flood_the_pilot():
+    memories = (OUT, Memory(seen=True), Memory(seen=True))
+    state = PolicyState(memories, at=START)
+    other = Imu(True, delivers=True, ok=True, size=0.0, agreed=START)
+    words = []
+    for k in range(100):
+        now = START + 60_000 * MS + k * 100 * MS
+        named = k % 2 == 0
+        first = Imu(False, now, named=named, delivers=True, size=0.0)
+        imus = (first, other._replace(heard=now), other._replace(heard=now))
+        view = View(imus, linked=True, disarmed=GROUNDED, monitored=True)
+        decision = decide(state, view, now, PolicySettings())
+        state = decision.state
+        words += decision.words
+    assert 5 <= len(words) <= 11
 
 
 @pytest.mark.parametrize("is_out", [True, False])
