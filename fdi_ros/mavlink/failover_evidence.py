@@ -63,7 +63,7 @@ CALM = 0.1
 TURN_RATE = 0.1
 #: One that was bad agrees only after a turn in which its error, if in proportion to the
 #: rate, would be this multiple of ``min_size``.
-SHOWN = 3.0
+SHOWN = 2.0
 TINY = 1e-3  #: Resolution of the messages, rad/s.
 WILD_OSCILLATION = (
     1.0  #: An oscillation with this standard deviation is an error, rad/s.
@@ -648,7 +648,8 @@ class Evidence:
         # What scatters does not agree from `CALM` on: twice that is shown by a shake.
         shake = self.raw.shake(other)[wrong.axis] / (2.0 * CALM)
         shown = max(abs(turn[wrong.axis]), SHOWN * self._min_size * shake)
-        return shown >= min(wrong.rate, SHOWN * self._min_size / wrong.share)
+        # Most of the rate at which it was seen is enough, if the error was small.
+        return shown >= min(0.8 * wrong.rate, SHOWN * self._min_size / wrong.share)
 
     def _note_names(self, unit: int, agreed: int | None, now: int) -> None:
         """Note which axes were named before the IMU has agreed for long."""
