@@ -34,6 +34,7 @@ from fdi_ros.inspection.fitness import (
     one_clock,
 )
 from fdi_ros.inspection.topics import (
+    BELIEVED,
     GAP_INTERVALS,
     TopicReport,
     burst_words,
@@ -151,7 +152,8 @@ def turned_units(path: Path, config: Config) -> str:
         return ""
     size = max(1, round(WINDOW * config.sample_rate))
     names = config.imus.names
-    with Recording(path) as recording:
+    # Damaged rates may be anything: their means overflow, and are left out.
+    with Recording(path) as recording, np.errstate(over="ignore", invalid="ignore"):
         means = [
             block.z[: len(block) // size * size]
             .reshape(-1, size, 3 * len(names))
@@ -159,7 +161,7 @@ def turned_units(path: Path, config: Config) -> str:
             for block in Samples(recording, config).blocks()
         ]
     slow = np.concatenate([np.zeros((0, 3 * len(names))), *means])
-    slow = slow[np.isfinite(slow).all(axis=1)]
+    slow = slow[(np.abs(slow) < BELIEVED).all(axis=1)]
     if len(slow) < LEAST_WINDOWS:
         return ""
     first, *others = np.split(slow - np.median(slow, axis=0), len(names), axis=1)
