@@ -38,7 +38,7 @@ coverage: venv ## share of the lines of Python that the quicker tests run, witho
 	@mkdir -p build
 	@$(RUN) python -m pytest --collect-only $(UNSEEN:%=--ignore=%) | awk '/::/ && n++ % $(EVERY) == 0' > build/covered
 	@test -s build/covered
-	@$(RUN) python -m pytest -n $(WORKERS) --dist worksteal --cov @build/covered $(ARGS)
+	@$(RUN) python -m pytest -n $(WORKERS) --dist worksteal --cov=fdi_ros @build/covered $(ARGS)
 
 check: venv ## style and types
 	@$(RUN) python -m ruff check .
