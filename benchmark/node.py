@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The live node beside two rclpy relays: latency, CPU, loss at 2 x 1 kHz, and the highest rate without loss.
+"""The live node, with gyros alone and with accelerometers, beside two rclpy relays: latency, CPU, loss at 2 x 1 kHz, and the highest rate without loss.
 
 Two Imu topics go in, one Imu comes out. The plain relay takes ordinary messages on a SingleThreadedExecutor and
 republishes one Imu per pair; the raw relay passes the bytes of one on with an EventsExecutor: the floor of rclpy.
@@ -24,6 +24,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 TOPICS = ("imu_1/data_raw", "imu_2/data_raw")
@@ -43,19 +44,16 @@ RATES = (
     20000,
 )
 SUSTAINED = 1e-3  # loss above this share is no sustained rate: the listener itself may be kept waiting for a moment
+NODE = (
+    *("-m", "fdi_ros.ros.process", "fdi_node", "--ros-args"),
+    *("--params-file", str(ROOT / "config" / "two_imus.yaml")),
+    *("-p", "bias.startup_bias_duration:=0.0"),
+    *("-p", "sample_rate:=1000.0"),
+    *("-p", "health.stuck_time:=0.0"),
+)
 CANDIDATES = {
-    "fdi_node": [
-        *("-m", "fdi_ros.ros.process", "fdi_node", "--ros-args"),
-        *("--params-file", str(ROOT / "config" / "two_imus.yaml")),
-        *(
-            "-p",
-            "bias.startup_bias_duration:=0.0",
-            "-p",
-            "sample_rate:=1000.0",
-            "-p",
-            "health.stuck_time:=0.0",
-        ),
-    ],
+    "gyros": [*NODE, "-p", "accelerometers.enabled:='off'"],
+    "both halves": [*NODE, "-p", "accelerometers.enabled:='on'"],
     "plain relay": [__file__, "relay", "plain"],
     "raw relay": [__file__, "relay", "raw"],
 }
@@ -91,7 +89,7 @@ def source(rate: float, seconds: float) -> None:
     from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import Imu
 
-    from fdi_ros.core.messages import ImuTemplate
+    from fdi_ros.core.messages import ImuTemplate, fill_force
 
     rclpy.init()
     node = rclpy.create_node("source")
@@ -102,11 +100,16 @@ def source(rate: float, seconds: float) -> None:
         time.sleep(0.05)
     time.sleep(0.5)
     template, nothing = ImuTemplate("imu"), (0.0,) * 9
-    values = np.random.default_rng(0).normal(0, 0.003, (5000, 2, 3)).tolist()
-    messages = [
-        [bytearray(template.fill(0, value, nothing)) for value in pair]
-        for pair in values
-    ]
+    rng = np.random.default_rng(0)
+    values = rng.normal(0, 0.003, (5000, 2, 3)).tolist()
+    forces = rng.normal([0.0, 0.0, 9.81], 0.15, (5000, 2, 3))
+
+    def encoded(value: list[float], force: Any) -> bytearray:
+        template.fill(0, value, nothing)
+        fill_force(template.bytes, template.at, 1.0, force, np.zeros(6))
+        return bytearray(template.bytes)
+
+    messages = [list(map(encoded, *pair)) for pair in zip(values, forces, strict=True)]
     start = time.perf_counter()
     for k in range(round(rate * seconds)):
         due = start + k / rate
