@@ -316,9 +316,15 @@ def update(
             column = at.columns[j]
             for r in range(count):
                 states.x[r] += share[r] * gain[r] * innovation[j]
+                row = states.p[r]
+                if share[r] == 1.0:
+                    # The whole gain, as of most states: the same in fewer operations.
+                    for c in range(r + 1):
+                        row[c] -= gain[r] * column[c]
+                    continue
                 for c in range(r + 1):
                     taken = 1.0 - (1.0 - share[r]) * (1.0 - share[c])
-                    states.p[r, c] -= taken * gain[r] * column[c]
+                    row[c] -= taken * gain[r] * column[c]
     for r in range(count):
         for c in range(r):
             states.p[c, r] = states.p[r, c]
