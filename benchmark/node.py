@@ -1,7 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The live node, with gyros alone and with accelerometers, beside two rclpy relays: latency, CPU, loss at 2 x 1 kHz, and the highest rate without loss.
+"""The live node, with gyros alone and with both halves, beside two rclpy relays.
+
+Latency, CPU, loss at 2 x 1 kHz, and the highest rate without loss.
 
 Two Imu topics go in, one Imu comes out. The plain relay takes ordinary messages on a SingleThreadedExecutor and
 republishes one Imu per pair; the raw relay passes the bytes of one on with an EventsExecutor: the floor of rclpy.

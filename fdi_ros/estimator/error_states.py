@@ -279,6 +279,19 @@ def subtract_errors(
 
 
 @compiled
+def reduce_row(row: Array, r: int, gain: float, share: Array, column: Array) -> None:
+    """Take the gain of state r off the lower part of its row of the covariance."""
+    if share[r] == 1.0:
+        # The whole gain, as of most states: the same in fewer operations.
+        for c in range(r + 1):
+            row[c] -= gain * column[c]
+        return
+    for c in range(r + 1):
+        taken = 1.0 - (1.0 - share[r]) * (1.0 - share[c])
+        row[c] -= taken * gain * column[c]
+
+
+@compiled
 def update(
     layout: Layout,
     states: ErrorStates,
@@ -316,15 +329,7 @@ def update(
             column = at.columns[j]
             for r in range(count):
                 states.x[r] += share[r] * gain[r] * innovation[j]
-                row = states.p[r]
-                if share[r] == 1.0:
-                    # The whole gain, as of most states: the same in fewer operations.
-                    for c in range(r + 1):
-                        row[c] -= gain[r] * column[c]
-                    continue
-                for c in range(r + 1):
-                    taken = 1.0 - (1.0 - share[r]) * (1.0 - share[c])
-                    row[c] -= taken * gain[r] * column[c]
+                reduce_row(states.p[r], r, gain[r], share, column)
     for r in range(count):
         for c in range(r):
             states.p[c, r] = states.p[r, c]
