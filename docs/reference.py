@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi_ros.config.config import PARAMETERS
-from fdi_ros.config.settings import NODES, REQUIRED, Field
+from fdi_ros.config.settings import NODE_SECTIONS, REQUIRED, Field
 from fdi_ros.experiments import PROTOCOLS
 from fdi_ros.experiments.montecarlo import protocol_class
 
@@ -229,7 +229,7 @@ def parameters() -> str:
 def node_parameters() -> str:
     """Parameters of the nodes that are none of the settings."""
     parts = []
-    for node, fields in NODES.items():
+    for node, fields in NODE_SECTIONS.items():
         rows = [
             (
                 f"`{name}`",

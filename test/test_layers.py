@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fdi_ros.system import REQUIRED
+from fdi_ros.system import REQUIREMENTS
 
 PACKAGE = Path(__file__).parents[1] / "fdi_ros"
 ARCHITECTURE = PACKAGE.parent / "docs" / "architecture.md"
@@ -202,5 +202,5 @@ print([name for name in set(sys.modules) - before if sys.modules[name] is not No
     assert parts.isdisjoint(OFFLINE)
     # Neither does Numba load its part of SciPy.
     assert {name.partition(".")[0] for name in loaded}.isdisjoint(
-        {*REQUIRED, "scipy", "rich", "pyarrow", "pymavlink"}
+        {*REQUIREMENTS, "scipy", "rich", "pyarrow", "pymavlink"}
     )

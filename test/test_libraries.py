@@ -63,7 +63,7 @@ def test_libraries_named_as_required_are_those_of_setup_py(root):
         r"install_requires=\[(.*?)\]", (root / "setup.py").read_text(), flags=re.DOTALL
     )
     names = set(re.findall(r'"(\w+)>=', required))
-    assert names == {*system.REQUIRED, "numpy", "numba", "PyYAML"}
+    assert names == {*system.REQUIREMENTS, "numpy", "numba", "PyYAML"}
 
 
 VERBS_WITHOUT = """

@@ -55,10 +55,11 @@ from fdi_ros.model.samples import Array, Bytes, Int
 Rows = NDArray[np.void]
 #: bytes that are read at once, much more than the longest record
 _PORTION_BYTES = 1 << 22
+#: number of the message that describes the others, and its bytes
 _FMT = 128
 _FMT_SIZE = 89
 #: bytes of a record before its values
-_HEAD = 3
+_RECORD_HEAD = 3
 _FIELD_TYPES = (
     {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "c": "<i2", "C": "<u2"}
     | {
@@ -114,7 +115,7 @@ _FLIGHT = {
     "CTUN": (),
     "PARM": ("Name", "Value"),
 }
-_THROTTLE = ("ThO", "ThrOut")
+_THROTTLE_FIELDS = ("ThO", "ThrOut")
 _TEMPERATURE = ("T", "Temp")
 _VEHICLE = re.compile(r"(?:Ardu|APM:)(Copter|Plane|Rover|Sub)\b")
 _UNITS = {
@@ -138,6 +139,7 @@ _OPTIONAL = (
     "ThO",
     "ThrOut",
 )
+#: subsystem of an ERR record: the EKF changed its primary lane
 _EKF_PRIMARY = 24
 _SUBSYSTEMS: dict[Any, str] = (
     {
@@ -176,7 +178,7 @@ def record_end(data: Bytes, position: int, sizes: Int, final: bool) -> int:
         return 0
     number = data[position + 2]
     size = _FMT_SIZE if number == _FMT else int(sizes[number])
-    if size < _HEAD:
+    if size < _RECORD_HEAD:
         return 0
     end = position + size
     if end > len(data) or (end + 2 > len(data) and not final):
@@ -200,7 +202,7 @@ def find_records(
     the number of bytes before that which belong to no record.
     """
     count = lost = position = 0
-    while position + _HEAD <= len(data):
+    while position + _RECORD_HEAD <= len(data):
         end = record_end(data, position, sizes, final)
         if end < 0:
             break
@@ -208,7 +210,7 @@ def find_records(
             begin = position
             position += 1
             # A hole of gigabytes is passed at the speed of memory.
-            while position + _HEAD <= len(data) and (
+            while position + _RECORD_HEAD <= len(data) and (
                 data[position] != 0xA3 or data[position + 1] != 0x95
             ):
                 position += 1
@@ -280,11 +282,11 @@ class DataflashLog(FlightLog):
 
         Returns its samples, the end of its last record, and the bytes that belong to no record.
         """
-        found = np.empty((2, len(data) // _HEAD + 1), dtype=np.int64)
+        found = np.empty((2, len(data) // _RECORD_HEAD + 1), dtype=np.int64)
         count, end, lost = find_records(data, self._sizes, final, found)
         number, offset = found[:, :count]
         for start in offset[number == _FMT].tolist():
-            self._describe(data[start + _HEAD : start + _FMT_SIZE].tobytes())
+            self._describe(data[start + _RECORD_HEAD : start + _FMT_SIZE].tobytes())
         order = np.argsort(number.astype(np.uint8), kind="stable")
         there, begins = np.unique(number[order], return_index=True)
         starts = dict(
@@ -409,7 +411,7 @@ class DataflashLog(FlightLog):
                 _stamp(rows).tolist(), rows["ModeNum"].tolist(), strict=True
             ):
                 self.add_mode(stamp, str(number))
-        elif column := next((one for one in _THROTTLE if one in columns), ""):
+        elif column := next((one for one in _THROTTLE_FIELDS if one in columns), ""):
             self.throttle.add(_stamp(rows), rows[column])
 
     def _factors(self, number: int, source: Source) -> Iterator[Array]:
@@ -457,7 +459,7 @@ def _layout(
         *(["DelaT"] if sensor and sensor[1] == "IMT" else []),
     }
     fields: dict[str, tuple[str, int]] = {}
-    at = _HEAD
+    at = _RECORD_HEAD
     for column, kind in zip(columns, types, strict=True):
         if column in (*needed, *acceleration, *_OPTIONAL) and kind in _TYPES_OF.get(
             column, _NUMBERS

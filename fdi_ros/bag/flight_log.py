@@ -42,12 +42,12 @@ from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, LogText, Topic
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Bytes, Int
-from fdi_ros.system.files import EARLIEST, LATEST, LOG_SPAN
+from fdi_ros.system.files import EARLIEST, LATEST_TIME, LOG_SPAN
 from fdi_ros.system.text import figures, shown
 
 IMU = "sensor_msgs/msg/Imu"
 SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
-MESSAGES = 'docs/flight_logs.md, "messages read"'
+MESSAGES_READ = 'docs/flight_logs.md, "messages read"'
 #: from FRD
 FLU = np.array([1.0, -1.0, -1.0])
 #: samples by which the rate of a source can be judged
@@ -78,6 +78,7 @@ _DEVICE_PARAMETER = re.compile(r"INS_GYR([23]?)_ID")
 LARGEST_DEVICE = 1 << 32
 #: full throttle, by the message: 1, per cent, or thousandths in old logs
 _FULL = (1.0, 100.0, 1000.0)
+#: larger values are damage: throttles of old logs pass 1000 a little
 _MOST_THROTTLE = 1500.0
 #: texts of a log that are kept: the first ones
 _MOST_TEXTS = 1000
@@ -462,7 +463,7 @@ class FlightLog(BagFile):
         """Leave out samples with impossible times, or times far from their neighbours."""
         stamp = samples["stamp"]
         good = ((stamp >= 0) & (stamp <= LOG_SPAN)) | (
-            (stamp >= EARLIEST // 1000) & (stamp <= LATEST // 1000)
+            (stamp >= EARLIEST // 1000) & (stamp <= LATEST_TIME // 1000)
         )
         if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _MAX_TIME_STEP).any():
             # Most of five neighbours are right, and a gap has neighbours on both sides.
@@ -564,7 +565,7 @@ class FlightLog(BagFile):
         if alone:
             there.append(f"{self.selected} of the one selected IMU {alone[0].figures}")
         if unread and not there:
-            return f" has of IMUs only {', '.join(unread)}: {MESSAGES}"
+            return f" has of IMUs only {', '.join(unread)}: {MESSAGES_READ}"
         setting = f"{self.settings} ({SETTINGS})"
         if not there:
             most = ", ".join(
@@ -647,7 +648,7 @@ def possible_start(utc: Int, stamp: Int) -> int | None:
         (stamp >= 0)
         & (stamp <= LOG_SPAN)
         & (utc >= EARLIEST // 1000)
-        & (utc <= LATEST // 1000 - LOG_SPAN)
+        & (utc <= LATEST_TIME // 1000 - LOG_SPAN)
     )
     return int((utc - stamp)[np.argmax(good)]) if good.any() else None
 

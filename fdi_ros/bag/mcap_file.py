@@ -43,10 +43,10 @@ from fdi_ros.core.messages import read_bits
 from fdi_ros.core.sources import source_of_type
 from fdi_ros.model.samples import Bytes, Int
 from fdi_ros.system.files import (
-    CHANNELS,
     CHUNK_BYTES,
     DESCRIPTION_BYTES,
     DESCRIPTIONS,
+    MOST_TOPICS,
     NAME,
     PORTION_BYTES,
     RECORD_BYTES,
@@ -64,7 +64,7 @@ STATISTICS = int(Opcode.STATISTICS)
 _PREFIX = 9
 #: bytes of a message record before the message: channel, sequence, log time, publish
 #: time
-_HEAD = 22
+_MESSAGE_HEAD = 22
 
 
 def decompress(
@@ -152,7 +152,7 @@ def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
             break
         if outside and opcode in (CHUNK, STATISTICS, FOOTER):
             break
-        head = _HEAD if opcode == MESSAGE else 0
+        head = _MESSAGE_HEAD if opcode == MESSAGE else 0
         described = opcode in (SCHEMA, CHANNEL)
         descriptions += described
         wanted = described and descriptions <= DESCRIPTIONS
@@ -438,9 +438,9 @@ class McapFile(BagFile):
             self.note(
                 f"the name {name[:NAME]!r} is longer than {NAME} and was left out"
             )
-        elif len(known) == CHANNELS:
+        elif len(known) == MOST_TOPICS:
             self.note(
-                f"it describes more than {CHANNELS} topics: the others were left out"
+                f"it describes more than {MOST_TOPICS} topics: the others were left out"
             )
         else:
             known[number] = what

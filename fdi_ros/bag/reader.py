@@ -40,8 +40,8 @@ from fdi_ros.config.config import is_topic
 from fdi_ros.core.sources import SOURCES, source_of_type
 from fdi_ros.errors import BagError
 from fdi_ros.system.files import (
-    CHANNELS,
-    LATEST,
+    LATEST_TIME,
+    MOST_TOPICS,
     max_unpacked_bytes,
     open_regular,
     scratch_folder,
@@ -122,9 +122,9 @@ class Recording:
         merged: dict[str, Topic] = {}
         for file in self._files:
             for topic in file.topics:
-                if len(merged) == CHANNELS and topic.name not in merged:
+                if len(merged) == MOST_TOPICS and topic.name not in merged:
                     self.damage.add(
-                        f"more than {CHANNELS} topics: the others were left out"
+                        f"more than {MOST_TOPICS} topics: the others were left out"
                     )
                     break
                 before = merged.get(topic.name)
@@ -193,7 +193,7 @@ class Recording:
                 progress=sum(walk.progress for walk in walks) / len(walks),
                 horizon=min(walk.horizon for walk in walks),
             )
-            possible = (batch.log_time >= 0) & (batch.log_time <= LATEST)
+            possible = (batch.log_time >= 0) & (batch.log_time <= LATEST_TIME)
             if not possible.all():
                 self.damage.add(
                     "messages recorded before 1970 or after 2038, by their times, were left out"

@@ -30,7 +30,7 @@ from fdi_ros.system.text import figures
 _MOST_AT_ONCE = 16384
 #: messages that wait for earlier ones at most
 _MOST_WAITING = 1 << 20
-RATE_TOLERANCE = 0.2
+WRONG_RATE = 0.2
 """Relative error of a configured sample rate at which thresholds and times are wrong."""
 _RATE_SAMPLES, _FEWEST_STEPS = 5000, 50
 """Samples that determine the rate of a recording, and the fewest intervals for that."""
@@ -313,7 +313,7 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
     """Check that samples with stamps (k,), ns, have the configured rate, Hz.
 
     `BagError` if both the median and the mean without gaps are off by more than
-    `RATE_TOLERANCE`: lost samples and bursts change only one. Fewer than 51
+    `WRONG_RATE`: lost samples and bursts change only one. Fewer than 51
     stamps are not checked.
     """
     steps = np.sort(np.diff(stamp)) * 1e-9
@@ -322,7 +322,7 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
     usual = 1.0 / np.median(steps)
     mean = 1.0 / steps[: -max(1, len(steps) // 100)].mean()
     off = np.array([usual, mean]) / configured
-    if (off > 1.0 + RATE_TOLERANCE).all() or (off < 1.0 - RATE_TOLERANCE).all():
+    if (off > 1.0 + WRONG_RATE).all() or (off < 1.0 - WRONG_RATE).all():
         raise BagError(
             f"{path}: sample_rate is {configured:g} Hz in the config and {figures(usual, 4)} Hz in the recording: set"
             f" sample_rate to {figures(usual, 4)}"

@@ -25,8 +25,8 @@ from fdi_ros.bag.library_bag import LibraryBag, Message
 from fdi_ros.bag.raw import NO_HORIZON, PACKED, Damage, Topic, unpack_message
 from fdi_ros.errors import BagError
 from fdi_ros.system.files import (
-    CHANNELS,
     CHUNK_BYTES,
+    MOST_TOPICS,
     NAME,
     STEPS,
     STEPS_PER_BYTE,
@@ -171,9 +171,9 @@ class SqliteFile(LibraryBag):
                 or max(map(len, (name, kind, encoding))) > NAME
             ):
                 self.note("a topic description is damaged and was left out")
-            elif len(found) == CHANNELS:
+            elif len(found) == MOST_TOPICS:
                 self.note(
-                    f"it has more than {CHANNELS} topics: the others were left out"
+                    f"it has more than {MOST_TOPICS} topics: the others were left out"
                 )
                 break
             else:

@@ -58,6 +58,7 @@ _OTHER_MESSAGES = (
 """Messages that are read beside the rates."""
 #: first bytes of messages of MAVLink 1 and 2
 _MARKS = (0xFE, 0xFD)
+#: bytes of the time before each message
 _TIME = 8
 #: bytes of the shortest record
 _LEAST = _TIME + 8
@@ -66,7 +67,7 @@ _MOST_BESIDE = 100_000
 #: largest time, us
 _LATEST = 1 << 53
 _ROW = struct.Struct("=3q7d")
-_COLUMNS = np.dtype(
+_SAMPLE_COLUMNS = np.dtype(
     [
         ("stamp", "i8"),
         ("came", "i8"),
@@ -119,7 +120,8 @@ class Tlog(LibraryLog):
         if raw in found and scaled not in found:
             found[scaled] = found.pop(raw)
         tables = {
-            source: np.frombuffer(rows, _COLUMNS) for source, rows in found.items()
+            source: np.frombuffer(rows, _SAMPLE_COLUMNS)
+            for source, rows in found.items()
         }
         self.start_utc = _start_utc_by(
             [table["came"] - table["stamp"] for table in tables.values()]
@@ -129,7 +131,7 @@ class Tlog(LibraryLog):
         for came, message in beside:
             self._take_beside(message, came, autopilot)
         return {
-            source: {name: table[name] for name in _COLUMNS.names or ()}
+            source: {name: table[name] for name in _SAMPLE_COLUMNS.names or ()}
             for source, table in tables.items()
         }
 

@@ -80,7 +80,7 @@ _THROTTLE = (
 """Topics and fields with the throttle, of newer and older versions."""
 _TEMPERATURES = (("gyro_device_id", "temperature_gyro"), ("device_id", "temperature"))
 """Fields with the device of a gyro and its temperature."""
-_COUNTED = ("gyro_error_count", "gyro_clipping")
+_COUNTED_FIELDS = ("gyro_error_count", "gyro_clipping")
 _HELD = {
     "temperature_gyro": "{low:.1f} to {high:.1f} degC",
     "gyro_vibration_metric": "vibration up to {high:.2g} rad/s",
@@ -407,7 +407,7 @@ def _status_words(
             values = [column for key, column in columns.items() if _is_of(key, name)]
             found = np.concatenate([np.empty(0), *values])
             found = found[np.isfinite(found)]
-            if len(found) and (found.max() > 0.0 or name not in _COUNTED):
+            if len(found) and (found.max() > 0.0 or name not in _COUNTED_FIELDS):
                 held.append(form.format(low=found.min(), high=found.max()))
         if held:
             words.append(f"imu_{source.instance} {', '.join(held)}")

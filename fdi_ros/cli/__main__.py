@@ -18,7 +18,7 @@ from types import FrameType
 from fdi_ros.cli import STOPPED
 from fdi_ros.signals import heeded
 
-PATIENCE = 2.0
+SIGNAL_PATIENCE = 2.0
 """Time after the first signal in which others are ignored, s: fdi removes unfinished files."""
 
 
@@ -36,7 +36,9 @@ class Stop:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal."""
         now = time.monotonic()
-        if not self.running or (self.asked is not None and now - self.asked > PATIENCE):
+        if not self.running or (
+            self.asked is not None and now - self.asked > SIGNAL_PATIENCE
+        ):
             os._exit(STOPPED)
         if self.asked is None:
             self.asked = now

@@ -33,7 +33,7 @@ from fdi_ros.system.text import LINE, did_you_mean, shown
 # Verbs
 
 Options = Mapping[str, Any]
-"""Keyword arguments of argparse for one argument. Those in `SHARED` need not be repeated."""
+"""Keyword arguments of argparse for one argument. Those in `SHARED_ARGUMENTS` need not be repeated."""
 
 
 class Verb(NamedTuple):
@@ -69,7 +69,7 @@ def shipped(kind: str) -> str:
 _CONFIG = "ROS 2 parameter file{}. The name alone gives a shipped one. May be repeated, later ones win"
 DETECTOR_NAMES = ", ".join(reversed(DETECTORS))
 """Names of the detectors for the help, the default first."""
-SHARED: Mapping[str, Options] = {
+SHARED_ARGUMENTS: Mapping[str, Options] = {
     "bag": takes_path(
         "rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file",
         metavar="BAG",
@@ -117,7 +117,7 @@ SHARED: Mapping[str, Options] = {
 """Arguments that several verbs share."""
 PART: Mapping[str, Options] = {"--start": {}, "--end": {}}
 WORKERS: Mapping[str, Options] = {"--workers": {}, "--scheduler": {}}
-RESULTS: Mapping[str, Options] = {"--json": {}, "--force": {}, "--quiet": {}}
+RESULT_ARGUMENTS: Mapping[str, Options] = {"--json": {}, "--force": {}, "--quiet": {}}
 """Arguments of every verb with results."""
 _SETTINGS: Mapping[str, Options] = {
     "--output": takes_path("parameter file to write", required=True),
@@ -148,7 +148,7 @@ VERBS = {
             "--report": takes(
                 "page with the results; default: beside the parameter file"
             ),
-            **RESULTS,
+            **RESULT_ARGUMENTS,
             "--degrees": {},
         },
         "recording:run_setup",
@@ -201,7 +201,7 @@ VERBS = {
                 "write a bag with the messages that the node would have published",
                 metavar="DIR",
             ),
-            **RESULTS,
+            **RESULT_ARGUMENTS,
             "--force": takes("overwrite outputs that exist"),
             "--degrees": {},
         },
@@ -217,7 +217,7 @@ VERBS = {
             "--urdf": takes_path(
                 "take the mounts of the units from this URDF, by the frame_id of their messages"
             ),
-            **RESULTS,
+            **RESULT_ARGUMENTS,
             "--degrees": {},
         },
         "recording:run_inspect",
@@ -233,7 +233,7 @@ VERBS = {
                 metavar="DIR",
                 required=True,
             ),
-            **RESULTS,
+            **RESULT_ARGUMENTS,
             "--force": takes("overwrite a bag made by fdi"),
         },
         "recording:run_convert",
@@ -249,7 +249,7 @@ VERBS = {
             "--config": takes(_CONFIG.format(" to start from")),
             **_SETTINGS,
             "--report": {},
-            **RESULTS,
+            **RESULT_ARGUMENTS,
             "--degrees": {},
         },
         "recording:run_calibrate",
@@ -269,7 +269,7 @@ VERBS = {
                 metavar="CONFIG",
             ),
             "--report": takes("write a page with tables and a picture"),
-            **RESULTS,
+            **RESULT_ARGUMENTS,
             "--degrees": {},
         },
         "settings:run_geometry",
@@ -293,7 +293,7 @@ VERBS = {
             ),
             **WORKERS,
             "--report": takes("write curves and tables as one page"),
-            **RESULTS,
+            **RESULT_ARGUMENTS,
         },
         "settings:run_montecarlo",
         POOL,
@@ -342,7 +342,7 @@ VERBS = {
             **PART,
             "--csv": takes("write a line for every fault"),
             "--report": {},
-            **RESULTS,
+            **RESULT_ARGUMENTS,
         },
         "replay:run_sweep",
         (*BAGS, *POOL),
@@ -378,7 +378,7 @@ VERBS = {
                 default="none",
             ),
             **WORKERS,
-            **RESULTS,
+            **RESULT_ARGUMENTS,
             "--force": takes(
                 "start over if the folder holds a run with other settings"
             ),
@@ -416,7 +416,7 @@ VERBS = {
                 default=[],
                 metavar="NAME",
             ),
-            **RESULTS,
+            **RESULT_ARGUMENTS,
         },
         "settings:run_shipped",
     ),
@@ -427,7 +427,7 @@ VERBS = {
             "--detector": takes(
                 f"detectors to compile; default: all: {DETECTOR_NAMES}", nargs="+"
             ),
-            **RESULTS,
+            **RESULT_ARGUMENTS,
         },
         "settings:run_compile",
     ),
@@ -675,7 +675,7 @@ def _parser() -> argparse.ArgumentParser:
         )
         for names, own in verb.arguments.items():
             action = added.add_argument(
-                *names.split(), **{**SHARED.get(names, {}), **own}
+                *names.split(), **{**SHARED_ARGUMENTS.get(names, {}), **own}
             )
             if names == "--fault":
                 action.help = f"{action.help}; kinds: %(kinds)s"

@@ -42,7 +42,7 @@ _FORMAT = "{percentage:3.0f} %|{bar:40}| {elapsed}, {remaining} left"
 _TIMED_FORMAT = "{desc}, {elapsed}"
 SAID_EVERY = 10.0
 """Period of the progress lines without a terminal, s."""
-_TICK = 1.0
+_BAR_PERIOD = 1.0
 """Period at which the bar in a terminal is refreshed, s."""
 
 
@@ -84,7 +84,7 @@ def progress(
 
     def tick() -> None:
         """Refresh the bar or print a line, even while the work itself reports nothing."""
-        while not ended.wait(SAID_EVERY if bar.disable else _TICK):
+        while not ended.wait(SAID_EVERY if bar.disable else _BAR_PERIOD):
             if is_compiling():
                 continue  # The compiler has progress lines of its own.
             if not bar.disable:
@@ -122,7 +122,7 @@ def progress(
 
 # Files and words
 
-_HEAD = 1 << 16
+_MARK_BYTES = 1 << 16
 """Size of the begin of a file that is searched for the mark of a result, bytes."""
 
 
@@ -136,7 +136,7 @@ class Kind(Enum):
     FOLDER = rb""  # an output bag, recognised by its metadata
 
 
-_KINDS = {
+_RESULT_KINDS = {
     "json": Kind.JSON,
     "csv": Kind.CSV,
     "report": Kind.PAGE,
@@ -175,7 +175,7 @@ class Outputs:
         self.targets: dict[str, Path] = {
             name: path for name in names if (path := getattr(arguments, name))
         }
-        self._kinds = {**_KINDS, "output": output}
+        self._kinds = {**_RESULT_KINDS, "output": output}
         wanted = [
             (path, kind)
             for name, path in self.targets.items()
@@ -374,7 +374,7 @@ def _what_stays(path: Path, kind: Kind) -> str:
     if not path.is_file():
         return "no file" if path.exists() else ""
     with open_regular(path) as file:
-        begin = file.read(_HEAD)
+        begin = file.read(_MARK_BYTES)
     return (
         "no result of fdi of this kind"
         if begin and not re.match(kind.value, begin)

@@ -50,6 +50,7 @@ warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning
 # one line, ``name: Real  # unit, meaning``. Type checkers see plain numbers, arrays and
 # other records. Records nest. A list of records is an array.
 
+# Compiled records have fixed sizes: more than 12 channels would cost everybody time.
 MAX_CHANNELS = 12
 MAX_UNITS = 4
 

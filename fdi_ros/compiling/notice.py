@@ -22,14 +22,14 @@ from fdi_ros.compiling.compiled import missing, name_of
 from fdi_ros.errors import FdiError
 
 LOG = logging.getLogger("fdi_ros")
-WORDS = "compiling for the first use; later runs find the result"
+COMPILING = "compiling for the first use; later runs find the result"
 YOUNG_OBJECTS = 7000
 """Young objects that start a garbage collection while the compiler runs. Python's default is a tenth of this. The
 compiler makes millions of objects that last, and the default costs a seventh of its time."""
 FIRST_REPORT = 2.0
 """Time from the notice to the first report of progress, s: by then some twenty functions are compiled."""
-REPORT_PERIOD = 5.0  # s
-LEAST_SHARE = 0.2
+NOTICE_PERIOD = 5.0  # s
+REPORTED_SHARE = 0.2
 """Share of the functions from which on the time left is reported. The first ones are small and say little."""
 _PASS = "numba:run_pass"
 """Event of Numba: a compiler pass.
@@ -126,14 +126,14 @@ def progress_logged(
     The time left, reported once a fifth of the functions is done, assumes that the rest takes as
     long for each function.
     """
-    LOG.warning(WORDS)
+    LOG.warning(COMPILING)
     begun = time.monotonic()
     over = threading.Event()
 
     def report() -> None:
         wait = FIRST_REPORT
         while not over.wait(wait):
-            wait = REPORT_PERIOD
+            wait = NOTICE_PERIOD
             left = (functions - done()) & missing()
             count = len(functions) - len(left)
             if not count:
@@ -146,7 +146,7 @@ def progress_logged(
                 count,
                 len(functions),
                 f", about {spent / share - spent:.0f} s left"
-                if share >= LEAST_SHARE
+                if share >= REPORTED_SHARE
                 else "",
             )
 

@@ -68,7 +68,7 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-_KINDS = {
+_ANNOTATION_KINDS = {
     "float | None": "float",
     "str": "text",
     "tuple[float, ...]": "numbers",
@@ -85,7 +85,9 @@ def fields_of(owner: Any) -> dict[str, Field]:
         if "description" in field.metadata
     ]
     return {
-        field.name: Field(_KINDS.get(kind, kind), field.default, **field.metadata)
+        field.name: Field(
+            _ANNOTATION_KINDS.get(kind, kind), field.default, **field.metadata
+        )
         for kind, field in declared
     }
 
@@ -705,7 +707,7 @@ MAVLINK = {
         "", "holds the IMUs out of use by failover; empty: ~/.ros/NODE_failover.json"
     ),
 }
-NODES = {
+NODE_SECTIONS = {
     "fdi_node": MONITOR,
     "injector_node": INJECTOR,
     "player_node": PLAYER,

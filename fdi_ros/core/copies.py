@@ -22,26 +22,26 @@ from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import MAX_RATE, Array
 
 #: Time between comparisons, ns. Copies are found on the ground.
-PERIOD = 1_000_000_000
+COMPARISON_PERIOD = 1_000_000_000
 #: Changes compared. Fewer quantised values of two gyros at rest may agree by chance.
 ROWS = 24
 #: Changes compared first, which usually exclude a copy.
-FEW = ROWS // 3
+FIRST_CHANGES = ROWS // 3
 #: Largest delay of a copy, samples.
 MAX_LAG = 20
 #: Comparisons that show a copy. A single one may be of values that hardly change.
 HITS = 2
 #: Smallest changes, as a share of the noise. Smaller changes are smooth, and motion may
 #: explain them.
-LEAST_NOISE = 0.02
+SMALLEST_CHANGE = 0.02
 
 
 @compiled
 def update_copies(
     copies: Copies, settings: PathSettings, buffer: DelayBuffer, stamp: int
 ) -> None:
-    """Compare all pairs of units once in `PERIOD`. ``copies.found`` is set for a new copy."""
-    if stamp - copies.stamp < PERIOD or buffer.count < ROWS + 3:
+    """Compare all pairs of units once in `COMPARISON_PERIOD`. ``copies.found`` is set for a new copy."""
+    if stamp - copies.stamp < COMPARISON_PERIOD or buffer.count < ROWS + 3:
         return
     copies.stamp = stamp
     for a in range(settings.units):
@@ -72,7 +72,7 @@ def is_copy(
         for turned in range(2):
             source, target = (second, first) if turned else (first, second)
             agrees = True
-            for wanted in (FEW, ROWS):
+            for wanted in (FIRST_CHANGES, ROWS):
                 agrees = agrees and sum_changes(
                     copies, buffer, source, target, lag, wanted
                 )
@@ -183,7 +183,7 @@ def is_explained(
     for i in range(3):
         if products[3 + i, 3 + i] > ROUNDING * copies.change[i]:
             return False
-    return size > count * 6.0 * LEAST_NOISE**2 * noise
+    return size > count * 6.0 * SMALLEST_CHANGE**2 * noise
 
 
 def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:

@@ -33,7 +33,7 @@ WORKED, HAS_RATE, HAS_EVENTS, MORE, SUPPLY, MALFORMED = 1, 2, 4, 8, 16, 32
 has a fused rate; the sample has events; another sample is ready; something must be
 prepared before the next call (which continues with the same sample if none was
 processed); the message was refused."""
-NEVER = -1  #: In place of a stamp.
+NO_STAMP = -1  #: In place of a stamp.
 #: Largest time of a live stamp ahead of the clock, ns: clocks of computers differ.
 AHEAD_OF_CLOCK = 1_000_000_000
 #: A clock set back by more than this is followed, ns. Smaller steps are waited out.
@@ -74,7 +74,7 @@ def receive_stamped(
         return MORE if live.ready else 0
     enter(aligner, unit, stamp)
     lag = aligner.units[unit].lag
-    inlet.lag = lag if inlet.lag == NEVER else min(lag, inlet.lag)
+    inlet.lag = lag if inlet.lag == NO_STAMP else min(lag, inlet.lag)
     if not live.ready and next_sample(aligner, live.sample):
         live.ready = True
     return MORE if live.ready else 0

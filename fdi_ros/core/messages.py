@@ -35,6 +35,7 @@ IMU_DOUBLES, IMU_BEFORE_RATE, IMU_BEFORE_FORCE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9, 3
 """Number of doubles of an Imu: all, those before the angular velocity (orientation and
 its covariance), and those from there to the linear acceleration."""
 _NS = 1_000_000_000
+#: seconds of a stamp are 32 bits with a sign
 _SIGN = 1 << 31
 #: Latest whole second that the header of a message can hold, ns.
 LAST_STAMP = (_SIGN - 1) * _NS

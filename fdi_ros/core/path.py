@@ -51,7 +51,7 @@ NOISIER = 1.8
 #: Share of the range. If the others predict less, a value out of range is a fault.
 RAIL_MARGIN = 0.9
 #: Smallest usual noise, as a share of the expected noise: at rest a value may repeat.
-QUIET = 0.3
+LEAST_USUAL = 0.3
 #: Time without noise after which noise is a new spell, ns.
 NOISY_BREAK = 1_000_000_000
 #: Time constants with which the usual noise follows more and less noise, s.
@@ -350,7 +350,7 @@ def update_noisy(core: Core) -> None:
 @compiled
 def times_as_noisy(core: Core, i: int) -> float:
     """Return the noise of a channel over the expected or usual one, whichever is smaller."""
-    usual = min(max(core.health.usual_noise[i], QUIET), 1.0)
+    usual = min(max(core.health.usual_noise[i], LEAST_USUAL), 1.0)
     return core.now.verdict.noise[i] / usual
 
 

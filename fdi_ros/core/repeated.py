@@ -36,7 +36,7 @@ AGREED = 0.5
 fault of one of three parallel channels moves their mean by a third of itself and leaves 0.8
 of itself as disagreement. Real motion leaves only noise."""
 #: Motion, in steps, up to which a quantised sensor repeats its value by chance.
-STEPS = 3.0
+REPEATED_STEPS = 3.0
 RESTS, AT_REST = 3.0, 1e-3
 """At rest the rate is at most three standard deviations of a channel plus one step of
 MAVLink, rad/s."""
@@ -215,7 +215,8 @@ def update_repeated(core: Core) -> int:
                 fresh = fresh or core.health.run_stamp[i] == core.now.evidence.stamp
                 moved = (
                     moved
-                    or abs(change) > sensors.noise_std[i] + STEPS * core.health.step[i]
+                    or abs(change)
+                    > sensors.noise_std[i] + REPEATED_STEPS * core.health.step[i]
                 )
         if fresh:
             for a in range(3):

@@ -355,6 +355,7 @@ class ImuSource(UnitSource):
 # -------------------------------------------------------------------------------------------
 
 
+#: a product of damaged dimensions ends here, before it overflows
 _MANY = 1 << 31
 MAX_DIMENSIONS = 16  # an array whose layout has more dimensions is no message of ours
 _DIMENSIONS, _CUT_ARRAY, _WRONG_COUNT, _CUT_VALUES, _GAPS = range(

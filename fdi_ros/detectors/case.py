@@ -51,7 +51,7 @@ from fdi_ros.detectors.sums import (
 from fdi_ros.estimator.error_states import ErrorStates, copy_states
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
-    LEAST_SHARE,
+    LEAST_NOISE_SHARE,
     LONG_TIME,
     SNAPSHOT_TIME,
     TIERS,
@@ -77,7 +77,7 @@ from fdi_ros.model.samples import Array
 STANDS = 0.6
 """Log odds that open a case, as a share of the logarithm of the run length. The sums need
 the whole logarithm, but here every uncertainty counts in full."""
-ENDS = 2.0  # log odds of the likeliest hypothesis below which a case ends: hardly better than none
+LEAST_ODDS = 2.0  # log odds of the likeliest hypothesis below which a case ends: hardly better than none
 # Channels are named again when the time that is explained has grown by 1 / RENAME.
 RENAME = 16
 SETTLED, SETTLED_AMONG_FEW = 0.2, 0.5
@@ -85,7 +85,7 @@ SETTLED_TOGETHER = 2.0 * SETTLED_AMONG_FEW
 """Time that a name must stand before it is declared, s: one channel, one channel with at
 most `FEW_CHECKS` checks, two channels. Several faults look like one at first, and with
 few checks three faults explain any mean."""
-CLEAR = 5000.0
+CLEAR_ODDS = 5000.0
 """Log odds from which a single fault is named at once. A second error a twentieth as large
 would then show by five standard deviations, (0.05^2) 2 CLEAR = 25."""
 OTHERS, TURNED = 6.0, 0.3
@@ -106,10 +106,10 @@ and while all channels are suspects, the estimator learns nothing better."""
 LOUDER = 3.0
 """Excess of the noise variance since the onset, over the learned variance, from which the noise has
 grown: the samples of a fault are as noisy as before."""
-STEPS = 16
+FEWEST_STEPS = 16
 """Smallest number of differences that show how noisy the last samples are. The two largest ones are
 left out, because the onset of a fault is no noise."""
-STEADY = 9.0
+STEADY_RATIO = 9.0
 """Square of the mean since the onset over the noise of single samples, from which the values are
 those of a fault: a filter spreads the onset of a fault over some samples, which is no noise."""
 MOVE_TIME = 1.0
@@ -123,6 +123,7 @@ still a shift: sines, as gains and delays show in turns, have much more."""
 LONGEST_WAIT = 0.5
 """Longest time from a refused case to the next one, s. Another fault is named nearly as soon as
 without the refused case."""
+#: Number of times over which a slow drift is searched.
 DRIFT_TIMES = 4
 LONGEST_DRIFT = WARMS * (1 << DRIFT_TIMES)
 """Longest time over which a slow drift is searched, s: 480. The search tries
@@ -233,7 +234,7 @@ def look_for_drift(params: Constants, state: State) -> None:
     for r in range(layout.n, layout.count):
         if 0 <= layout.feeds[r] < layout.n:
             prior = layout.prior[r] * layout.prior[r]
-            learned = max(prior - kf.states.p[r, r], LEAST_SHARE * prior)
+            learned = max(prior - kf.states.p[r, r], LEAST_NOISE_SHARE * prior)
             worst = max(worst, kf.states.x[r] * kf.states.x[r] / learned)
     if worst < 2.0 * math.log(params.limit):
         return
@@ -272,7 +273,8 @@ def look_for_change_in_hole(params: Constants, state: State) -> None:
                 posterior += share * kf.states.p[j, k]
         if kf.judged >> i & 1:
             worst = max(
-                worst, change * change / max(prior - posterior, LEAST_SHARE * prior)
+                worst,
+                change * change / max(prior - posterior, LEAST_NOISE_SHARE * prior),
             )
     if worst >= 2.0 * math.log(params.limit):
         case.onset = kf.hole_sample + 1
@@ -503,14 +505,14 @@ def fill_louder(params: Constants, state: State, size: int) -> bool:
     for i in range(params.sensors.n):
         inference.louder[i] = 0.0
         if kf.judged >> i & 1:
-            grown = mean_step(scale, i, min(max(size - 1, STEPS), KEPT - 1), 2)
-            if 1 < size <= STEPS:
+            grown = mean_step(scale, i, min(max(size - 1, FEWEST_STEPS), KEPT - 1), 2)
+            if 1 < size <= FEWEST_STEPS:
                 grown = max(grown, mean_step(scale, i, size - 1, size > 3))
-            if square_of_mean(scale, i, min(size, KEPT)) > STEADY * grown:
+            if square_of_mean(scale, i, min(size, KEPT)) > STEADY_RATIO * grown:
                 continue
             # The statistic shows a share of the noise of its channel.
             own = kf.parity.information[i, i] * kf.noise.now.sample[i]
-            share = min(max(own, LEAST_SHARE), 1.0)
+            share = min(max(own, LEAST_NOISE_SHARE), 1.0)
             excess = (grown * normal_variance(kf, i) - 1.0) / share
             inference.louder[i] = max(excess - LOUDER, 0.0) * kf.noise.now.sample[i]
             is_louder = is_louder or inference.louder[i] > 0.0
@@ -647,7 +649,7 @@ def time_to_settle(params: Constants, inference: Inference) -> float:
     """Return the time that a name must stand before it is declared, s."""
     if inference.common & (inference.common - 1):
         return SETTLED_TOGETHER
-    if inference.log_odds >= CLEAR:
+    if inference.log_odds >= CLEAR_ODDS:
         return 0.0
     if redundancy(inference.mask, params.sensors.n) > FEW_CHECKS:
         return SETTLED
@@ -732,7 +734,7 @@ def undo_move(params: Constants, state: State) -> None:
     case.moved = math.e * LARGEST_MOVES * params.largest_move
     case.moved_at = state.estimator.seconds
     # The way that the bias has gone is evidence by itself.
-    open_case(params, state, ENDS)
+    open_case(params, state, LEAST_ODDS)
 
 
 @compiled
@@ -761,7 +763,7 @@ def follow_case(params: Constants, state: State) -> None:
     name_channels(params, state)
     if (
         case.open
-        and case.inference.log_odds < ENDS
+        and case.inference.log_odds < LEAST_ODDS
         and (case.louder or (kf.samples - case.onset) * params.period > 1.0)
     ):
         forget_evidence(params, state)

@@ -44,7 +44,7 @@ from fdi_ros.estimator.error_states import (
     subtract_errors,
 )
 from fdi_ros.estimator.estimator import Constants, Estimator, Total, total_before
-from fdi_ros.estimator.noise import BLOCK, BURST, MOTION, Noise
+from fdi_ros.estimator.noise import BLOCK, BURST_FACTOR, MOTION, Noise
 from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import Array
 
@@ -52,7 +52,9 @@ SHIFTS, SMALLEST_SHIFT = 5, 1.0 / 16.0
 """Number of sizes of a shift of all biases, and the smallest one, standard deviation over
 `Constants.largest_move`. Each further size is twice as large, up to 40 mrad/s of gyros: a
 boost of 10 g moves a gyro of 2 mrad/s a g by 20, and at its end by as much again."""
-MOST = MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS + SHIFTS
+MOST_HYPOTHESES = (
+    MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS + SHIFTS
+)
 """Largest number of hypotheses: channels, pairs, three for each unit, shifts of all biases."""
 COINCIDENCE = 0.1
 """Prior odds, against one channel, of all pairs with that channel and of each way in which
@@ -83,12 +85,13 @@ FEW_CHECKS = 3
 SET_MARGIN = 5.0
 """Accepted risk that a set misses one of several faulty channels, as a multiple of the
 risk of a wrong name. The risk that it misses all of them is far smaller."""
+#: Log odds of what is impossible. Infinity would give NaN in differences.
 NO_LOG = -1e300
 
-Odds = Annotated[NDArray[np.float64], "f8", (MOST,)]
-Sets = Annotated[NDArray[np.int64], "i8", (MOST,)]
-Wholes = Annotated[NDArray[np.uint8], "u1", (MOST,)]
-Errors = Annotated[NDArray[np.float64], "f8", (MOST, MAX_CHANNELS)]
+Odds = Annotated[NDArray[np.float64], "f8", (MOST_HYPOTHESES,)]
+Sets = Annotated[NDArray[np.int64], "i8", (MOST_HYPOTHESES,)]
+Wholes = Annotated[NDArray[np.uint8], "u1", (MOST_HYPOTHESES,)]
+Errors = Annotated[NDArray[np.float64], "f8", (MOST_HYPOTHESES, MAX_CHANNELS)]
 Directions = Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]
 
 
@@ -214,7 +217,7 @@ def noise_of_mean(params: Constants, noise: Noise, i: int, size: int) -> float:
         colour = max(1.0, noise.now.level[BLOCK, i] * slow)
         variance *= noise.unknown[i] * colour
     else:
-        burst = variance * max(1.0, BURST * noise.recent_ratio[i])
+        burst = variance * max(1.0, BURST_FACTOR * noise.recent_ratio[i])
         variance = max(burst, noise.now.block[i] * slow * size / params.length)
     return variance / size
 

@@ -99,7 +99,7 @@ from fdi_ros.model.samples import MAX_RATE
 
 # shortest fault that is declared, s: two samples at 100 Hz, because one value decides nothing
 LEAST_TIME = 0.02
-PAUSE = 5.0
+LONGEST_HOLE = 5.0
 """Longest hole in the stream, s, that keeps the learned slow noise. After a longer one the
 vehicle may move differently."""
 LEAST_SCALE, LEAST_TIMING, LEAST_NONLINEARITY = 1e-3, 3e-4, 3e-4
@@ -138,7 +138,7 @@ def pass_time(params: Constants, state: State, sample: SampleInput) -> float:
         forget_motion(kf, params.sensors.n)
         forget_evidence(params, state)
         pass_hole(params, kf, seconds)
-        if seconds > PAUSE:
+        if seconds > LONGEST_HOLE:
             kf.noise.regime_seconds[REST] = kf.noise.regime_seconds[MOTION] = 0.0
             update_unknown(kf.noise, params.sensors.n, 0.0)
         kf.mask = 0

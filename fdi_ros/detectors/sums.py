@@ -26,7 +26,7 @@ from fdi_ros.compiling.compiled import (
 from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import (
     BLOCK,
-    BURST,
+    BURST_FACTOR,
     FAR,
     LONG,
     SAMPLE,
@@ -186,7 +186,7 @@ def normal_variance(kf: Estimator, i: int) -> float:
     """Return the variance of the statistic of a sample, by recent noise and by slow noise."""
     noise = kf.noise
     slow = noise.now.level[BLOCK, i] * noise.unknown[i] * noise.longest[i]
-    return max(1.0, BURST * noise.recent_ratio[i], slow)
+    return max(1.0, BURST_FACTOR * noise.recent_ratio[i], slow)
 
 
 @compiled

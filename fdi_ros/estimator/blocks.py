@@ -25,7 +25,7 @@ from fdi_ros.estimator.error_states import (
     update,
 )
 from fdi_ros.estimator.estimator import (
-    LEAST_SHARE,
+    LEAST_NOISE_SHARE,
     REST_BLOCKS,
     Constants,
     Estimator,
@@ -35,7 +35,7 @@ from fdi_ros.estimator.estimator import (
 from fdi_ros.estimator.noise import MOTION, REST
 from fdi_ros.estimator.shared_noise import UNEQUAL
 
-TURNING = 20.0
+TURNING_RATIO = 20.0
 """Ratio of the squared angular acceleration to its noise variance from which the body
 turns. If noise passed for motion, delays of zero would be learned."""
 # Smallest share of a channel's error in its residual. Below it no method judges the
@@ -80,7 +80,7 @@ def update_acceleration(params: Constants, kf: Estimator) -> float:
         * worst
         / params.length
     )
-    if apart <= TURNING * single or span > 2.0 * params.length * params.period:
+    if apart <= TURNING_RATIO * single or span > 2.0 * params.length * params.period:
         return noise
     # Vibration faster than a block is not resolved, so its traces must not be learned as a delay.
     kf.shaken = apart
@@ -104,7 +104,7 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
     for a in range(3):
         square += kf.acceleration[a] * kf.acceleration[a]
     # At rest a rate on which no channels agree is a fault, not motion.
-    turning = square > TURNING * noise + kf.shaken and kf.noise.regime == MOTION
+    turning = square > TURNING_RATIO * noise + kf.shaken and kf.noise.regime == MOTION
     kf.turning = turning
     kf.turn_noise = noise
     if kf.noise.regime == REST:
@@ -168,7 +168,7 @@ def judge_block(params: Constants, kf: Estimator) -> float:
             chi += kf.block_values[i] * kf.block_innovation[i]
         if information[i, i] > 0.0:
             by_noise = variance_along(information[i], kf.block_noise, n)
-            noise.share[i] = max(by_noise / information[i, i], LEAST_SHARE)
+            noise.share[i] = max(by_noise / information[i, i], LEAST_NOISE_SHARE)
         for j in range(n):
             kf.block_information[i, j] = information[i, j]
     free = number_in(mask, n) - 3.0
@@ -330,7 +330,7 @@ def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
         change = (kf.rates[0, a] - kf.rates[1, a]) / ahead
         square += change * change
     moves = kf.noise.regime == MOTION
-    begins = kf.turning or (moves and square > 4.0 * TURNING * kf.turn_noise)
+    begins = kf.turning or (moves and square > 4.0 * TURNING_RATIO * kf.turn_noise)
     for i in range(n):
         turn = speed = 0.0
         for a in range(3):

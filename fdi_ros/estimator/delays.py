@@ -10,7 +10,9 @@ from fdi_ros.estimator.estimator import Constants, Estimator
 
 # s. A smaller delay stays an error state: its first order is accurate enough
 LEAST_COMPENSATED_DELAY = 0.002
-SURE = 25.0  # squared delay over its variance from which values are moved by the delay
+SURE_DELAY = (
+    25.0  # squared delay over its variance from which values are moved by the delay
+)
 # s that are made up for at most: what `RESTAMP_SAMPLES` hold at 16 kHz
 LONGEST_DELAY = 0.06
 
@@ -45,7 +47,10 @@ def transfer_delays(params: Constants, kf: Estimator) -> bool:
         place = params.layout.delays[u]
         delay = kf.states.x[place]
         variance = kf.states.p[place, place]
-        if abs(delay) > LEAST_COMPENSATED_DELAY and delay * delay > SURE * variance:
+        if (
+            abs(delay) > LEAST_COMPENSATED_DELAY
+            and delay * delay > SURE_DELAY * variance
+        ):
             step = min(
                 max(delay, -LONGEST_DELAY - kf.late[u]), LONGEST_DELAY - kf.late[u]
             )

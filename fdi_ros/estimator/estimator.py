@@ -75,7 +75,7 @@ SAMPLES, BLOCKS, COARSE = (
     512,
 )  # totals kept: of the last samples, of blocks, and of every `BLOCKS_PER_COARSE`th block
 # Smallest share of noise in the variance of a statistic. A smaller share is rounding.
-LEAST_SHARE = 0.02
+LEAST_NOISE_SHARE = 0.02
 # Smallest share of a channel's variance that must remain in its residual. With less, no
 # residual shows a fault of the channel.
 SENSITIVE = 1e-6
@@ -323,7 +323,7 @@ def update_weights(params: Constants, kf: Estimator) -> None:
         if kf.mask >> i & 1 and information * kf.matrix[i, i] > SENSITIVE:
             kf.judged |= 1 << i
             share = variance_along(kf.parity.information[i], noise.now.sample, n)
-            kf.share[i] = max(share / information, LEAST_SHARE)
+            kf.share[i] = max(share / information, LEAST_NOISE_SHARE)
             # Scale the state uncertainty to 100 Hz, so that the check does not depend
             # on the sample rate.
             hidden = kf.ideal_information[i] / information - 1.0

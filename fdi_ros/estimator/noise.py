@@ -45,7 +45,7 @@ THREE_SIGMA, FAR = 9.0, 100.0
 ten, which none does."""
 # The half-second variance counts with this factor if that exceeds the learned variance.
 # The factor allows for its scatter.
-BURST = 0.75
+BURST_FACTOR = 0.75
 # Smallest ratio of a variance to the expected one: noise may return to normal at any
 # time.
 QUIETEST = 0.1
@@ -54,11 +54,11 @@ QUIETEST_BLOCK = 0.03
 # Largest ratio of a block variance to the expected one: such noise hides any fault.
 LOUDEST = 1e4
 # Assumed ratio of the long-time variance to the block variance before it is measured.
-UNKNOWN = 16.0
+UNKNOWN_RATIO = 16.0
 # Slow noise is unknown again from this ratio of the squared rate to the largest so far.
 FASTER = 16.0
 # Standard deviations of a wild value. A wild value before a normal one is no fault.
-WILD = 5.0
+WILD_STD = 5.0
 # Prior: one wild value in 200 000, with the weight of 4000 samples.
 WILD_EVENTS, WILD_SAMPLES = 0.02, 4000.0
 # Factor on a long-time level. It allows for the scatter of an estimate from 80 values.
@@ -72,7 +72,7 @@ the first guess."""
 TAIL_SCATTER = 2.8
 # samples per degree of freedom: `TRUST` is reached in half a minute at 100 Hz
 LEARNED_IN = 64.0
-RECENT = 4
+RECENT_BLOCKS = 4
 """Number of last blocks of which at least three show a burst of noise. An onset, even one
 that a filter spreads, or a spike is in two of them at most."""
 SELECTED = 2.5
@@ -87,7 +87,7 @@ Rates = Annotated[NDArray[np.float64], "f8", (3, 3)]
 ByAxis = Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]
 Two = Annotated[NDArray[np.float64], "f8", (2,)]
 Four = Annotated[NDArray[np.float64], "f8", (SCALES,)]
-Recent = Annotated[NDArray[np.float64], "f8", (RECENT, MAX_CHANNELS)]
+Recent = Annotated[NDArray[np.float64], "f8", (RECENT_BLOCKS, MAX_CHANNELS)]
 
 
 @record
@@ -193,7 +193,7 @@ def begin_noise(noise: Noise, n: int, expected: Array) -> None:
                 levels.level[k, i] = 1.0
         noise.recent_ratio[i] = noise.square[i] = noise.share[i] = 1.0
         noise.squares[0, i] = noise.squares[1, i] = 1.0
-        noise.unknown[i] = 1.0 + UNKNOWN
+        noise.unknown[i] = 1.0 + UNKNOWN_RATIO
         noise.loudest[i] = expected[i]
         noise.degrees[i] = TRUST
         noise.neighbours[i] = 1.0 + 0.5 / (TRUST - 3.0)
@@ -269,7 +269,7 @@ def update_sample_noise(
             noise.largest[i] = max(energy, noise.largest[i])
             noise.steps[i] += min(square * inflation[i], THREE_SIGMA)
             noise.counted[i] += 1.0
-            step = square / max(1.0, BURST * noise.recent_ratio[i])
+            step = square / max(1.0, BURST_FACTOR * noise.recent_ratio[i])
             if learn:
                 noise.neighbours[i] += gain * (
                     min(step * noise.squares[slot, i], FAR) - noise.neighbours[i]
@@ -288,7 +288,7 @@ def count_wild(noise: Noise, scale: int, n: int, mask: int, t: Array) -> None:
     """
     for i in range(n):
         if mask >> i & 1:
-            if abs(noise.last[scale, i]) > WILD and t[i] * t[i] < THREE_SIGMA:
+            if abs(noise.last[scale, i]) > WILD_STD and t[i] * t[i] < THREE_SIGMA:
                 noise.wild[scale, i] += 1.0
             noise.last[scale, i] = t[i]
         noise.cap[scale, i] = (noise.seen[scale] + WILD_SAMPLES) / (
@@ -323,7 +323,7 @@ def update_sample_variance(
             if part > 0.0:
                 # The states change once in a block, and values with them.
                 steps = max(noise.counted[i] - 1.0, 1.0)
-                noise.energies[blocks % RECENT, i] = noise.energy[i] / steps
+                noise.energies[blocks % RECENT_BLOCKS, i] = noise.energy[i] / steps
             lasting = SELECTED * lasting_energy(noise, i)
             if lasting > FAR:
                 noise.recent_ratio[i] = max(noise.recent_ratio[i], lasting)
@@ -340,7 +340,7 @@ def update_sample_variance(
 def lasting_energy(noise: Noise, i: int) -> float:
     """Return the second smallest mean half squared difference of the last blocks of channel i."""
     least = second = math.inf
-    for k in range(RECENT):
+    for k in range(RECENT_BLOCKS):
         energy = noise.energies[k, i]
         if energy < least:
             second = least
@@ -464,7 +464,7 @@ def follow_loudness(noise: Noise, n: int, louder: float, seconds: float) -> None
     """Begin to learn the slow noise of a channel anew where it is ``louder`` times as loud as ever before."""
     for i in range(n):
         noise.since[i] += seconds
-        variance = noise.now.sample[i] * max(1.0, BURST * noise.recent_ratio[i])
+        variance = noise.now.sample[i] * max(1.0, BURST_FACTOR * noise.recent_ratio[i])
         if variance > louder * noise.loudest[i]:
             noise.loudest[i] = variance
             noise.since[i] = 0.0
@@ -477,6 +477,6 @@ def update_unknown(noise: Noise, n: int, seconds: float) -> None:
     seconds_in_regime = noise.regime_seconds[noise.regime]
     for i in range(n):
         known = min(seconds_in_regime, noise.since[i])
-        noise.unknown[i] = 1.0 + UNKNOWN / (
+        noise.unknown[i] = 1.0 + UNKNOWN_RATIO / (
             1.0 + 0.25 * known * known / noise.longest[i]
         )

@@ -24,7 +24,7 @@ from fdi_ros.estimator.estimator import (
     motion_ratio,
     usual_chi,
 )
-from fdi_ros.estimator.noise import BURST, FAR, THREE_SIGMA
+from fdi_ros.estimator.noise import BURST_FACTOR, FAR, THREE_SIGMA
 from fdi_ros.model.samples import Array
 
 OUTLIER = 5.5  # standard deviations, reached by normal noise in one of 2e7 values
@@ -32,7 +32,7 @@ OUTLIER = 5.5  # standard deviations, reached by normal noise in one of 2e7 valu
 CANDIDATE_SHARE = 0.95
 # longest spike: re-stamping spreads a single value over its neighbours
 SPIKE_SAMPLES = 4
-MISFIT = 1e-4
+SPIKE_MISFIT = 1e-4
 """Share of the chi-square that a true hypothesis may leave: 1 % of the spike shows in other
 channels, because their scale errors were corrected at a rate that contains the spike."""
 # ratio of squared changes of the rate below which the smaller one decides
@@ -75,7 +75,7 @@ def explain_outliers(
 ) -> None:
     """Find the channels that explain an outlying sample, and whether they may be a spike."""
     fill_sample_covariance(params, kf)
-    limit = MISFIT * chi_without(params, kf, 0)
+    limit = SPIKE_MISFIT * chi_without(params, kf, 0)
     chosen = choose(params, kf, candidates, burst, limit)
     if chosen == 0:
         chosen = remove_farthest(params, kf, burst)
@@ -96,7 +96,7 @@ def explain_outliers(
 def excess_of(kf: Estimator, i: int) -> float:
     """Return the present noise variance of a channel over the learned one."""
     level = kf.shared.level[i] / kf.noise.now.sample[i]
-    return max(1.0, BURST * kf.noise.recent_ratio[i], level)
+    return max(1.0, BURST_FACTOR * kf.noise.recent_ratio[i], level)
 
 
 @compiled

@@ -14,7 +14,9 @@ from fdi_ros.estimator.estimator import LONG_TIME, REST_BLOCKS, Constants, Estim
 from fdi_ros.estimator.noise import REST, THREE_SIGMA
 from fdi_ros.model.samples import Array
 
-QUIET = 3.0  # largest block variance over earlier rest: a hover in vibration has more
+REST_RATIO = (
+    3.0  # largest block variance over earlier rest: a hover in vibration has more
+)
 # rad/s, of the rate at rest: rotation of the earth, vibration of a table
 REST_STD = 3e-4
 UNLEARNED = 0.003  # rad/s, largest bias uncertainty in the test: a larger mean rate may be a turn
@@ -91,6 +93,6 @@ def update_rest(params: Constants, kf: Estimator) -> None:
         for i in range(n):
             if (
                 kf.masks[1] >> i & 1
-                and kf.noise.now.block[i] > QUIET * kf.noise.kept[REST].block[i]
+                and kf.noise.now.block[i] > REST_RATIO * kf.noise.kept[REST].block[i]
             ):
                 kf.rest = kf.rest and kf.noise.regime == REST

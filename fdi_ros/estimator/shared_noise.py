@@ -39,7 +39,7 @@ from fdi_ros.core.algebra import dot, invert, quadratic, variance_along
 from fdi_ros.core.parity import apply_gain, fill_parity
 from fdi_ros.core.subsets import number_in
 from fdi_ros.estimator.estimator import Constants, Estimator
-from fdi_ros.estimator.noise import BURST, FAR, PAST, THREE_SIGMA, SharedNoise
+from fdi_ros.estimator.noise import BURST_FACTOR, FAR, PAST, THREE_SIGMA, SharedNoise
 from fdi_ros.model.samples import Array
 
 MEMORY = 2.0  # averaging time of all quantities of this module, in half seconds
@@ -47,7 +47,7 @@ MEMORY = 2.0  # averaging time of all quantities of this module, in half seconds
 LINE_EXCESS = 1.0 / 6.0
 INCOHERENT = 0.25  # squared correlation that independent noise may have in one second
 COHERENT = 1.0 - INCOHERENT  # squared correlation from which all noise counts as a line
-STEADY = 4.0
+STEADY_ENERGY = 4.0
 """Largest energy of the differences of the rate, in units of the noise, at which they
 may shift variance between parallel channels. In stronger motion a channel that sees a
 tenth more of it would look noisier. At this limit its variance is wrong by a sixth."""
@@ -197,7 +197,7 @@ def update_shared_level(params: Constants, kf: Estimator) -> None:
         shared.checked_blocks[noise.regime] = min(before + 1.0, MOST_CHECKED)
     for i in range(n):
         own = noise.now.sample[i]
-        level = own * max(1.0, BURST * noise.recent_ratio[i], shared.excess)
+        level = own * max(1.0, BURST_FACTOR * noise.recent_ratio[i], shared.excess)
         seen = variance_along(params.sensors.axes[i], shared.vibration, 3)
         if checks > 0.0:
             level = max(level, own + UNEQUAL * UNEQUAL * seen)
@@ -274,7 +274,7 @@ def update_coherence(params: Constants, kf: Estimator) -> float:
     noise = kf.noise
     adaptation_gain = params.adaptation_gain / MEMORY if shared.taken else 0.0
     count = max(shared.taken, 1)
-    steady = update_common(shared, adaptation_gain, count) < STEADY
+    steady = update_common(shared, adaptation_gain, count) < STEADY_ENERGY
     explained = total = 0.0
     for i in range(n):
         noise.cross[i] = along = 0.0

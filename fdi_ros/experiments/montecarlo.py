@@ -262,7 +262,7 @@ PREPARING, TRIALS = (
     0,
     1,
 )  # the first stage prepares what the trials of the second need: thresholds, limits
-FORMAT = 1  # of the JSON
+STUDY_FORMAT = 1  # of the JSON
 
 
 class Block(NamedTuple):
@@ -391,7 +391,7 @@ def run_study(
             )
         )
     return StudyResult(
-        FORMAT, __version__, study.name, study.title, study.seed, sections
+        STUDY_FORMAT, __version__, study.name, study.title, study.seed, sections
     )
 
 

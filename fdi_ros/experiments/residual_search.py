@@ -31,6 +31,7 @@ from fdi_ros.replay.outcomes import share
 Index = NDArray[np.intp]
 
 STANDS_OUT, PRINTED, ALL = "stands_out", "printed", "all"
+#: The protocol draws normal errors within three standard deviations.
 CLIP = 3.0
 LOOSE_FALSE_ALARM = 0.98
 """False-alarm probability of the loose thresholds: every method names a channel nearly always, as the protocol counts

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fdi_ros.estimator.estimator import REST_BLOCKS
-from fdi_ros.inspection.segments import LARGEST_BIAS, LENGTH
+from fdi_ros.inspection.segments import LARGEST_BIAS, SEGMENT_LENGTH
 from fdi_ros.inspection.topics import (
     TopicReport,
 )
@@ -83,7 +83,7 @@ def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
     beyond = largest > largest_rate
     # Values in deg/s stay below twice the range of the gyro.
     lasting = beyond & (largest < 2.0 * DEGREES.factor * largest_rate)
-    each = report.segments.every * LENGTH / REST_BLOCKS
+    each = report.segments.every * SEGMENT_LENGTH / REST_BLOCKS
     often = beyond.mean() > FAST_SHARE
     return bool(each * (beyond if often else lasting).sum() > FAST_TIME)
 
@@ -111,7 +111,7 @@ def _rest_of(report: TopicReport) -> _Rest:
         if lies
     ]
     quiet = float(report.segments.noise().quiet.min())
-    seconds = len(still) * report.segments.every * LENGTH
+    seconds = len(still) * report.segments.every * SEGMENT_LENGTH
     if not still:
         return _Rest(0.0, 0.0, quiet, np.zeros(report.channels))
     bias = np.median(still, axis=0)

@@ -39,7 +39,7 @@ _OF_A_MONITOR = {
     for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
 }
 #: default of imus.timeout and of health.stale_timeout, s
-TIMEOUT = float(PARAMETERS["imus.timeout"].default)
+DEFAULT_TIMEOUT = float(PARAMETERS["imus.timeout"].default)
 #: kinds of input, first those with stamps
 _PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
 NEEDED = ", or ".join(
@@ -155,7 +155,7 @@ def not_waited_for(reports: Sequence[TopicReport], timeout: float) -> str:
     )
 
 
-def one_clock(reports: Sequence[TopicReport], timeout: float = TIMEOUT) -> str:
+def one_clock(reports: Sequence[TopicReport], timeout: float = DEFAULT_TIMEOUT) -> str:
     """Return why the stamps of these topics cannot be compared, empty if they can.
 
     ``timeout``: time for which a silent unit is waited for, s.

@@ -20,8 +20,8 @@ from fdi_ros.estimator.rest import REST_STD, rests
 from fdi_ros.model.samples import Array, Int
 
 #: length of a segment, s; slow channels need longer ones to fill every block
-LENGTH = BLOCK_TIME * REST_BLOCKS
-SMOOTH = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
+SEGMENT_LENGTH = BLOCK_TIME * REST_BLOCKS
+PARABOLA = np.array([-2.0, 3.0, 6.0, 7.0, 6.0, 3.0, -2.0]) / 21.0
 """Local parabola through seven values (Savitzky and Golay 1964). Its residual is noise."""
 #: ratio to the quietest noise that counts as quiet, and rounds to find such segments
 AS_QUIET, ROUNDS = (
@@ -33,7 +33,7 @@ VIBRATION_RATIO = 2.0
 #: rad/s, that a gyro at rest has
 LARGEST_BIAS = 0.1
 #: segments kept; longer recordings keep every second one, then every fourth
-MOST = 4096
+MOST_SEGMENTS = 4096
 
 
 class NoiseSegment(NamedTuple):
@@ -73,7 +73,7 @@ class NoiseSegments:
         values = np.vstack([self._waiting, values])
         times = np.concatenate([self._times, times])
         size = (
-            REST_BLOCKS * max(round(LENGTH * rate / REST_BLOCKS), 1)
+            REST_BLOCKS * max(round(SEGMENT_LENGTH * rate / REST_BLOCKS), 1)
             if rate
             else len(values) + 1
         )
@@ -82,7 +82,7 @@ class NoiseSegments:
             if self._passed % self.every == 0:
                 self._kept.append(_segment(values[k : k + size], int(times[k])))
             self._passed += 1
-            if len(self._kept) > MOST:
+            if len(self._kept) > MOST_SEGMENTS:
                 self._kept = self._kept[::2]
                 self.every = 2 * self.every
         self._waiting = values[full:]
@@ -194,10 +194,11 @@ def _segment(values: Array, first: int) -> NoiseSegment:
 
 
 def _noise(values: Array) -> Array:
-    inside = len(SMOOTH) // 2
-    smooth = np.column_stack([np.convolve(v, SMOOTH, mode="valid") for v in values.T])
+    inside = len(PARABOLA) // 2
+    smooth = np.column_stack([np.convolve(v, PARABOLA, mode="valid") for v in values.T])
     # The parabola absorbs a share of white noise.
     noise = np.sqrt(
-        np.mean((values[inside:-inside] - smooth) ** 2, axis=0) / (1.0 - SMOOTH[inside])
+        np.mean((values[inside:-inside] - smooth) ** 2, axis=0)
+        / (1.0 - PARABOLA[inside])
     )
     return np.where(noise > LEAST_NOISE, noise, 0.0)

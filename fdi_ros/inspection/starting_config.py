@@ -27,7 +27,7 @@ from fdi_ros.core.alignment import MAX_BRIDGE
 from fdi_ros.core.sources import input_of
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.inspection.fitness import (
-    TIMEOUT,
+    DEFAULT_TIMEOUT,
     candidates,
     left_out,
     needs,
@@ -44,7 +44,7 @@ from fdi_ros.inspection.turns import (
     LEAST_WINDOWS,
     SHARED,
     SQUARE,
-    WINDOW,
+    TURN_WINDOW,
     angle_of,
     find_turn,
 )
@@ -150,7 +150,7 @@ def turned_units(path: Path, config: Config) -> str:
     """Name the units that measure the motion of the first one along other axes, may be empty."""
     if not config.imus.topics:
         return ""
-    size = max(1, round(WINDOW * config.sample_rate))
+    size = max(1, round(TURN_WINDOW * config.sample_rate))
     names = config.imus.names
     # Damaged rates may be anything: their means overflow, and are left out.
     with Recording(path) as recording, np.errstate(over="ignore", invalid="ignore"):
@@ -222,7 +222,7 @@ def starting_config(
     else:
         known |= _settings_of_array(chosen[0], urdf)
     if silent := _longer(chosen, GAP_INTERVALS, 60.0):
-        known["health.stale_timeout"] = silent, f"the default is {TIMEOUT:g} s"
+        known["health.stale_timeout"] = silent, f"the default is {DEFAULT_TIMEOUT:g} s"
     return StartingConfig(
         shown(bag.name),
         {name: value for name, (value, _) in known.items()},
@@ -290,7 +290,7 @@ def _settings_of_units(
     if timeout := _longer(chosen, _BRIDGED, 10.0):
         slowest = min(report.rate for report in chosen)
         none = "none would be aligned between two"
-        words = f"messages come at {figures(slowest)} Hz: with the default {TIMEOUT:g} s {none}"
+        words = f"messages come at {figures(slowest)} Hz: with the default {DEFAULT_TIMEOUT:g} s {none}"
         known["imus.timeout"] = timeout, words
     return known, mounted
 
@@ -344,7 +344,7 @@ def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> flo
         if one.intervals
     ]
     needed = max([*(intervals * report.interval for report in chosen), *nearly_all])
-    return min(_rounded_up(needed), most) if needed > TIMEOUT else 0.0
+    return min(_rounded_up(needed), most) if needed > DEFAULT_TIMEOUT else 0.0
 
 
 def _starts_at_rest(report: TopicReport) -> bool:

@@ -39,11 +39,11 @@ GAP_INTERVALS = 3.0
 #: intervals by which the usual one is known
 SETTLED_STEPS = 100
 #: usual interval over the most frequent one: beyond, messages come in bursts
-BURST = 2.0
+BURST_RATIO = 2.0
 #: messages of a topic whose intervals are kept
 MOST_INTERVALS = 1_000_000
 #: messages in a row in which copies are looked for
-RECENT = 256
+RECENT_MESSAGES = 256
 #: larger values are damage, rad/s; their squares must not overflow
 BELIEVED = 1e6
 
@@ -108,7 +108,7 @@ class TopicReport:
         )  # (c,) values that are not finite, and values beyond all rates
         self.recent = np.zeros(
             (0, channels)
-        )  # (K, c) values of the last messages, at most `RECENT`
+        )  # (K, c) values of the last messages, at most `RECENT_MESSAGES`
         # Specific forces over the natural size of `FORCE`: then the same test finds rest.
         self.forces = NoiseSegments(channels)
 
@@ -124,7 +124,7 @@ class TopicReport:
         if len(steps) < SETTLED_STEPS:
             return 1
         usual = usual_interval(steps)
-        if usual <= BURST * float(np.median(steps)):
+        if usual <= BURST_RATIO * float(np.median(steps)):
             return 1
         return max(2, round(len(steps) / max(1, int((steps > usual).sum()))))
 
@@ -245,7 +245,7 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     if pairs.any():
         lasting = np.minimum(sizes[1:], sizes[:-1])[pairs].max()
         report.lasting = float(np.fmax(report.lasting, lasting))
-    report.recent = np.vstack([report.recent, values])[-RECENT:]
+    report.recent = np.vstack([report.recent, values])[-RECENT_MESSAGES:]
     whole = believed.all(axis=1)
     report.segments.add(values[whole], times[whole], report.rate)
     if kind.stamped:
@@ -262,7 +262,7 @@ def usual_interval(steps: Array) -> float:
     run = min(SETTLED_STEPS // 2, len(steps))
     ends = np.concatenate([[0.0], np.cumsum(steps)])
     mean = float(np.median(ends[run:] - ends[:-run])) / run
-    return mean if mean > BURST * median else median
+    return mean if mean > BURST_RATIO * median else median
 
 
 def _take_times(report: TopicReport, times: Int) -> None:

@@ -19,7 +19,7 @@ LEAST_ROTATION = 0.05
 LEAST_WINDOWS = 20
 #: Time over which rates are averaged before units are compared, s: turns by hand stay,
 #: noise goes.
-WINDOW = 0.25
+TURN_WINDOW = 0.25
 #: Share of the rotation that two units of one body have in common at least. Vibration
 #: and late stamps take the rest.
 SHARED = 0.7

@@ -34,6 +34,7 @@ from fdi_ros.system.files import open_regular
 MOST_AT_ONCE = 1 << 15  #: Bytes read before others get their turn.
 MOST_WAITING = 1 << 12  #: Bytes that may wait to be sent: half a second of a slow line.
 REOPEN_EVERY = NS  #: Time between two attempts to open a link, ns.
+#: Bytes read at once, more than the longest datagram of MAVLink.
 _DATAGRAM = 1 << 11
 _UNREACHABLE = (
     errno.ECONNREFUSED,
@@ -229,11 +230,12 @@ def open_link(url: str) -> Link:
     )
 
 
+#: Length of a key of MAVLink 2, bytes.
 KEY_BYTES = 32
 BLOCK = 13  #: Bytes of a signature: link id, time, and 6 of the digest.
 EPOCH = 1_420_070_400  #: Unix time from which signatures count, s: 2015.
 STEPS_PER_SECOND = 100_000  #: Steps of time in a second.
-LARGEST_DELAY = 60 * STEPS_PER_SECOND  #: Largest delay of a new sender, steps.
+LARGEST_LAG = 60 * STEPS_PER_SECOND  #: Largest delay of a new sender, steps.
 _SENDERS = 16  # largest number of links of the autopilot
 
 
@@ -294,7 +296,7 @@ class Verifier:
         if sender in self._latest:
             if time <= self._latest[sender]:
                 return False
-        elif time < now - LARGEST_DELAY:
+        elif time < now - LARGEST_LAG:
             self.behind = (now - time) / STEPS_PER_SECOND
             return False
         elif len(self._latest) >= _SENDERS:

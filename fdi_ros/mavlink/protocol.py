@@ -37,6 +37,7 @@ Vector = tuple[float, float, float]
 GYRO_UPDATED = 0b111000  #: Bits of ``fields_updated`` of HIGHRES_IMU for a new gyro.
 ARDUPILOT, PX4 = 3, 12  # MAV_AUTOPILOT of a HEARTBEAT
 NO_AUTOPILOT = 8  #: MAV_AUTOPILOT of other components.
+#: Largest number of IMUs that the messages of any stack number.
 MOST_UNITS = 4
 
 

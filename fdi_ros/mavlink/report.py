@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from fdi_ros.mavlink.link import Link
 from fdi_ros.mavlink.protocol import ENOUGH, IMU_MESSAGES, MS, NS, RESOLUTION, numbers
 from fdi_ros.mavlink.vehicle import LOST_AFTER, UnitTrack, Vehicle
-from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine
+from fdi_ros.monitor.diagnostics import MONITOR_LINE, Level, StatusLine
 
 WARNED_LOSS = 0.05  #: Share of lost messages from which the link is a WARN.
 
@@ -253,7 +253,7 @@ class Announcer:
         """Accelerometers in words, by the names of their channels."""
         self._now: dict[str, tuple[str, str]] = {
             **dict.fromkeys((*channels, *self._forces), ("OK", "")),
-            WHOLE: ("", ""),
+            MONITOR_LINE: ("", ""),
         }
         """State and set of each channel, and the trouble of the whole. Empty: none."""
         self._said = dict(self._now)  # the same as last announced
@@ -275,12 +275,12 @@ class Announcer:
             state = line.value("state")
             if line.value("repeats for (s)") and state not in ("FAULTY", "AMBIGUOUS"):
                 state = FROZEN
-            if line.name == WHOLE:
+            if line.name == MONITOR_LINE:
                 words = _format_whole(line)
                 is_none = words == NOTHING_SEEN
                 self._nothing_since = (self._nothing_since or now) if is_none else None
                 if now - (self._nothing_since or 0) >= NOTHING_SEEN_FOR:
-                    self._note(WHOLE, (words, ""), now)
+                    self._note(MONITOR_LINE, (words, ""), now)
             elif line.name in self._apart and (state in _STATES or state in _FINE):
                 self._apart[line.name] = line.value("apart (rad/s)").partition(" ")[0]
                 error = abs(line.number("estimated error (rad/s)"))
@@ -300,7 +300,7 @@ class Announcer:
     def due(self, now: int) -> list[tuple[int, str]]:
         """Return the texts to be sent now, ns, each with its severity."""
         if self._heard and now - self._heard > MONITOR_SILENT:
-            self._note(WHOLE, ("the monitor is silent", ""), now)
+            self._note(MONITOR_LINE, ("the monitor is silent", ""), now)
         self._tokens = min(AT_ONCE, self._tokens + (now - self._filled) / EVERY)
         self._filled = now
         if self._changed is not None and now - self._changed < SHARED_WITHIN:
@@ -347,13 +347,13 @@ class Announcer:
         # Of equal severity the whole comes first.
         return sorted(
             found + [(name,) for name in left if name not in together],
-            key=lambda names: names != (WHOLE,),
+            key=lambda names: names != (MONITOR_LINE,),
         )
 
     def _text(self, names: tuple[str, ...]) -> tuple[int, str]:
         """Return the text about a group of channels, or about the whole."""
         state, group = self._now[names[0]]
-        if names == (WHOLE,):
+        if names == (MONITOR_LINE,):
             return (
                 (CRITICAL, f"FDI: {state}")
                 if state

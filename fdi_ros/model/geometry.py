@@ -21,6 +21,7 @@ from fdi_ros.errors import GeometryError
 from fdi_ros.model.samples import Array
 from fdi_ros.system.text import html_table, listed
 
+#: Three axes determine the rate; a fourth makes it redundant.
 MIN_CHANNELS = 4
 MIN_NORM, MAX_NORM = 0.5, 2.0
 #: |rho| above which two channels have, in practice, the same parity direction.
@@ -317,7 +318,7 @@ def _rotation(mount: ArrayLike, index: int) -> Array:
 #: Cosine of the largest angle between channels that measure the same axis: 10 deg.
 PARALLEL = 0.985
 #: Largest number of names listed one by one.
-_FEW = 3
+_FEW_NAMES = 3
 
 
 def are_parallel(geometry: Geometry, channels: Sequence[int]) -> bool:
@@ -371,10 +372,10 @@ def one_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
     others = [
         name for i, name in enumerate(geometry.channel_names) if i not in channels
     ]
-    if len(names) > _FEW:
+    if len(names) > _FEW_NAMES:
         return (
             f"any channel but {listed(others, 'or')}"
-            if len(others) <= _FEW
+            if len(others) <= _FEW_NAMES
             else f"any of {len(names)} channels"
         )
     return listed(names, "or")

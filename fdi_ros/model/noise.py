@@ -462,7 +462,7 @@ def solve_log(tail: Callable[[float], float], level: float, start: float) -> flo
 DETECTION = 0.99
 #: Third singular value below which directions are in one plane, since mounts are uncertain.
 IN_PLANE = 0.1
-MOST_SETS = 4  #: Largest number of listed sets of channels.
+LISTED_SETS = 4  #: Largest number of listed sets of channels.
 
 
 def smallest_detectable(
@@ -518,8 +518,8 @@ def assumption_words(geometry: Geometry) -> str:
     """
     names = geometry.channel_names
     sets = ["/".join(names[i] for i in found) for found in coincidences(geometry)]
-    shown = ", ".join(sets[:MOST_SETS]) + (
-        f" and {len(sets) - MOST_SETS} more sets" if len(sets) > MOST_SETS else ""
+    shown = ", ".join(sets[:LISTED_SETS]) + (
+        f" and {len(sets) - LISTED_SETS} more sets" if len(sets) > LISTED_SETS else ""
     )
     return (
         f"no two failing alike of {shown}: they would look like a fault of the third"

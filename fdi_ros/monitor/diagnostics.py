@@ -28,7 +28,7 @@ Values = tuple[tuple[str, str], ...]
 
 PREFIX = "fdi_node: "
 """Default prefix of all names. A node uses its full name instead."""
-WHOLE = "monitor"
+MONITOR_LINE = "monitor"
 """Name of the line about the monitor as a whole, after the prefix."""
 INPUT = "input "
 """Begin of the names of input topics, after the prefix."""
@@ -37,7 +37,7 @@ FAR_FROM_NOW = 1.0
 OLD = 86400.0
 """Delay behind the clock from which on stamps probably belong to a recording, s."""
 OLD_WORDS = " (of a recording? then use_sim_time, and a player that gives the clock)"
-CERTAIN = 4.0
+CERTAIN_DELAY = 4.0
 """Smallest delay between units that is reported, in standard deviations."""
 LEAST_DELAY = 0.001
 """Smallest delay that is reported, s. Drivers often differ by less, which makes an error of
@@ -195,7 +195,7 @@ def describe(
         message = f"{message}; {warning}"
     word = Word.CANNOT_TELL if silent is not None else live_word(status, concerns)
     values = (("verdict", word.value), *_whole_values(status), *figures)
-    rows = [(WHOLE, level, message, values)]
+    rows = [(MONITOR_LINE, level, message, values)]
     for k, channel in enumerate(status.channels):
         values = _channel_values(
             channel, status, k, since[k] if since else channel.since
@@ -247,7 +247,7 @@ def _find_worse(status: Status) -> dict[str, list[str]]:
         if not one.is_left_out
     }
     for unit in status.units:
-        if abs(unit.delay) > max(CERTAIN * unit.delay_std, LEAST_DELAY):
+        if abs(unit.delay) > max(CERTAIN_DELAY * unit.delay_std, LEAST_DELAY):
             side = "late" if unit.delay > 0 else "early"
             off = ", taken off" if unit.taken_off else ""
             size = f"{1e3 * abs(unit.delay):.1f} +- {1e3 * unit.delay_std:.1f} ms"

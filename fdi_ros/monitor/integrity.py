@@ -33,6 +33,7 @@ NO_LEVEL: Axes = (math.inf,) * 3
 
 MIN_LEFT = 1e-3  # smallest singular value of S_LL. Below, L reaches no residual, or its channels cannot be told apart
 MIN_SPREAD = 1e-9  # residuals with less than this share of the channel's standard deviation are rounding
+# bisections of an interval, after which it is as narrow as rounding
 _HALVINGS = 48
 _erfc = np.frompyfunc(math.erfc, 1, 1)
 

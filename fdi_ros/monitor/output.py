@@ -74,7 +74,7 @@ class Event:
         return f"Event({', '.join(_cells(self, ()))})"
 
 
-_HEAD = ("stamp s", "channel", "change", "why")
+_TABLE_HEAD = ("stamp s", "channel", "change", "why")
 
 
 def format_reason(event: Event, names: Sequence[str]) -> str:
@@ -235,7 +235,7 @@ class Output:
     def _repr_html_(self) -> str:
         return html_table(
             repr(self),
-            _HEAD,
+            _TABLE_HEAD,
             (_cells(event, self.channel_names) for event in self.events),
         )
 

@@ -18,7 +18,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, as_block
 from fdi_ros.core.copies import copies_among
 from fdi_ros.core.decision import clear_declarations
-from fdi_ros.core.live import MORE, NEVER, process
+from fdi_ros.core.live import MORE, NO_STAMP, process
 from fdi_ros.core.messages import ImuTemplate, MessageError, as_batch
 from fdi_ros.core.path import Path
 from fdi_ros.core.records import EventRow, Live
@@ -152,7 +152,7 @@ class Receiver:
         )  # why the last malformed message of each topic was refused
         self.live["channels"] = n
         self.live["accelerometers"] = len(pipeline.channel_names) - n
-        self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NEVER
+        self.live["inlets"]["stamp"] = self.live["inlets"]["lag"] = NO_STAMP
         if pipeline.undecided:
             # Built now: no sample is to wait for that.
             pipeline.build_accelerometers(range(len(self.source.topics)))
@@ -279,7 +279,7 @@ class Receiver:
         clear_declarations(path.core)
 
 
-_FEW = 5  # channels for a method that does not take six
+_FEW_CHANNELS = 5  # channels for a method that does not take six
 
 
 def warm_detector(name: str) -> None:
@@ -288,7 +288,9 @@ def warm_detector(name: str) -> None:
     for one in vars(sys.modules[method.__module__]).values():
         if isinstance(one, Callback):
             _ = one.address
-    geometry = Geometry.cone(_FEW) if method.refuses(6) else Geometry.two_triad_cone()
+    geometry = (
+        Geometry.cone(_FEW_CHANNELS) if method.refuses(6) else Geometry.two_triad_cone()
+    )
     create_detector(name, geometry, NoiseModel(0.01, bound=0.04)).detect(
         np.zeros((1, geometry.n))
     )

@@ -47,8 +47,8 @@ USUAL_QUANTILE = 0.9
 MOST_RATES = 600
 """Largest number of rates of a unit, from which its usual rate follows."""
 
-_COUNTED = ("samples", "missing", "non-finite", "out of range", "spikes")
-_UNCHECKED = (ChannelState.UNCHECKED, ChannelState.STALE)
+_COUNTED_KINDS = ("samples", "missing", "non-finite", "out of range", "spikes")
+_UNCHECKED_STATES = (ChannelState.UNCHECKED, ChannelState.STALE)
 
 
 class _Reading(NamedTuple):
@@ -57,7 +57,7 @@ class _Reading(NamedTuple):
     at: float
     """Time, s."""
     counts: NDArray[np.int64]
-    """(5, n) counts of each channel, in the order of ``_COUNTED``."""
+    """(5, n) counts of each channel, in the order of ``_COUNTED_KINDS``."""
     unchecked: Mask
     """(n,) channels that no other channel checks."""
     residual: Array
@@ -193,8 +193,10 @@ def _reading(status: Status, inputs: Sequence[InputStatus], at: float) -> _Readi
     channels = status.channels
     return _Reading(
         at=at,
-        counts=np.array([[one.counts[kind] for one in channels] for kind in _COUNTED]),
-        unchecked=np.array([one.state in _UNCHECKED for one in channels]),
+        counts=np.array(
+            [[one.counts[kind] for one in channels] for kind in _COUNTED_KINDS]
+        ),
+        unchecked=np.array([one.state in _UNCHECKED_STATES for one in channels]),
         residual=np.array(
             [
                 one.residual if one.state == ChannelState.OK else math.nan

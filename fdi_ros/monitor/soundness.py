@@ -36,7 +36,7 @@ LEAST_NOISY_S = 3.0
 """Duration of noise that is reported, s."""
 LEAST_RESIDUAL = 1e-9
 """Smallest residual that counts as measured, rad/s, as the smallest ``noise.noise_std``."""
-LEAST_SHARE = 1e-3
+LEAST_VISIBLE_SHARE = 1e-3
 """Smallest share of the errors of a channel that is taken to show in its residual."""
 LEAST_SPIKES = 3
 """Single wrong samples from which on a channel has spikes. Fewer may be chance."""
@@ -180,7 +180,7 @@ def own_noise(residual_rms: Array, axes: Array) -> Array:
         weight = np.where(known, 1.0 / variance, 0.0)
         inverse = np.linalg.pinv(axes.T @ (weight[:, None] * axes), hermitian=True)
         leverage = weight * np.einsum("ij,jk,ik->i", axes, inverse, axes)
-        share = np.maximum(1.0 - leverage, LEAST_SHARE)
+        share = np.maximum(1.0 - leverage, LEAST_VISIBLE_SHARE)
         variance = np.sqrt(variance * square / share)
     result: Array = np.sqrt(variance)
     return result

@@ -31,16 +31,16 @@ from fdi_ros.monitor.accelerometers import possible_units
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.system.files import DistrustError, open_regular, read_trusted, replacing
 
-FORMAT = 3
-BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')  # what a state file begins with
+STATE_FORMAT = 3
+FILE_BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')  # what a state file begins with
 MAX_BYTES = 1 << 20  # largest state file, bytes. Longer files are damaged
 PLAUSIBLE = 5.0  # expected standard deviations within which a saved error is believed, beside its walk since
-MOVED = 2.0
+SAVED_CHANGE = 2.0
 """Errors are saved again once one of them differs from its saved value by this many
 standard deviations, or is known this many times better. A smaller change is covered by
 the random walk that is added for the age of the file when it is restored."""
 DIGITS = 9  # of the figures saved
-RETRY = 1.0  # time until a failed save is tried again, s
+SAVE_RETRY = 1.0  # time until a failed save is tried again, s
 
 
 def configuration_hash(config: Config) -> str:
@@ -132,9 +132,10 @@ def _differs(state: dict[str, Any], kept: dict[str, Any] | None) -> bool:
     if now is None or then is None:
         return now is not then
     std, std_then = (np.sqrt(np.diag(errors["covariance"])) for errors in (now, then))
-    moved = np.abs(now["value"] - then["value"]) > MOVED * std
+    moved = np.abs(now["value"] - then["value"]) > SAVED_CHANGE * std
     return bool(
-        (moved | (std_then > MOVED * std)).any() or (now["late"] != then["late"]).any()
+        (moved | (std_then > SAVED_CHANGE * std)).any()
+        or (now["late"] != then["late"]).any()
     )
 
 
@@ -381,7 +382,7 @@ class StateFile:
                 )
             with open_regular(path, links=False) as file:
                 begin = file.read(64)
-            if begin and not BEGIN.match(begin):
+            if begin and not FILE_BEGIN.match(begin):
                 raise ConfigError(
                     f"state_file is {str(self.path)!r}, but {str(path)!r} holds no state of a monitor:"
                     " name another file, or move it away"
@@ -393,7 +394,7 @@ class StateFile:
         if not _differs(state, self._kept) or time.monotonic() < self._not_before:
             return False
         about = {
-            "format": FORMAT,
+            "format": STATE_FORMAT,
             "configuration": configuration_hash(pipeline.config),
             "saved": time.time(),
         }
@@ -409,7 +410,7 @@ class StateFile:
         except OSError as error:
             self.words = f"state cannot be saved to {self.path}: {error.strerror}"
             self.failed = True
-            self._not_before = time.monotonic() + RETRY
+            self._not_before = time.monotonic() + SAVE_RETRY
         else:
             self._kept = state
             self.failed = False
@@ -417,8 +418,8 @@ class StateFile:
         return True
 
     def _restore_from(self, saved: Any, pipeline: Pipeline) -> None:
-        if saved["format"] != FORMAT:
-            raise RefusalError(f"format {saved['format']!r}, expected {FORMAT}")
+        if saved["format"] != STATE_FORMAT:
+            raise RefusalError(f"format {saved['format']!r}, expected {STATE_FORMAT}")
         if saved["configuration"] != configuration_hash(pipeline.config):
             raise RefusalError("it was saved with another configuration")
         age = time.time() - float(saved["saved"])

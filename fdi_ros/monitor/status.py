@@ -38,8 +38,8 @@ from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.system.text import listed, plus_minus
 
 # standard deviations from which two channels of a larger set surely differ
-CERTAIN = 4.0
-LOST = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
+CERTAIN_DIFFERENCE = 4.0
+LOST_STATES = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
 UNUSUAL = 3.0  # expected standard deviations from which an error is unusual
 
 MAX_START_BIAS = 4.0  # a start bias of more bias.turn_on_std is reported: one healthy start in 16 000
@@ -98,7 +98,7 @@ class ChannelStatus:
     @property
     def is_left_out(self) -> bool:
         """Whether its values count for nothing."""
-        return self.state in LOST or self.reason is Reason.COPY
+        return self.state in LOST_STATES or self.reason is Reason.COPY
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,7 @@ def status_of(
     state = core["state"][:n]
     repeated = flags_of(int(core["copies"]["channels"]), n)
     detectable, isolable, note, rests_on = _capability(
-        detector, ~(np.isin(state, LOST) | repeated)
+        detector, ~(np.isin(state, LOST_STATES) | repeated)
     )
     seen = detectable & (state != ChannelState.UNCHECKED)
     well = mask_of(
@@ -544,7 +544,7 @@ def _apart(guard: Detector, core: Any, quantity: Quantity) -> ApartStatus | None
         elif len(group) > 2:
             continue
         certainty = size / std if std > 0.0 else math.inf
-        if certainty > largest and (len(group) == 2 or certainty >= CERTAIN):
+        if certainty > largest and (len(group) == 2 or certainty >= CERTAIN_DIFFERENCE):
             names = geometry.channel_names[a], geometry.channel_names[b]
             found = ApartStatus(
                 names,

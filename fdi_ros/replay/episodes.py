@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from fdi_ros.report.layout import FORCES, RADIANS, Unit
 from fdi_ros.system.text import figures, plus_minus
 
-GAP = 10.0
+STRETCH_GAP = 10.0
 """Gap between two stretches, s. A shorter hole is within a stretch: messages were lost."""
 HOLE = 1.0
 """Longest time without samples over which faults are injected and curves are drawn, s."""

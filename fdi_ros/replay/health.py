@@ -22,13 +22,13 @@ from fdi_ros.monitor.soundness import UnitHealth
 
 MOST_WINDOWS = 4096
 """Windows in which messages are counted. For longer recordings their length doubles."""
-WINDOW = 1.0
+FIRST_WINDOW = 1.0
 """Length of a window at first, s."""
 MESSAGES_IN_WINDOW = 20.0
 """Smallest mean number of messages in a window for a rate."""
 USUAL_QUANTILE = 0.9
 """Quantile of the counts of a unit that is its usual count, even if the unit is slow for long."""
-SLOW = 0.6
+SLOW_SHARE = 0.6
 """Share of the usual count below which a unit is slow."""
 LEAST_SLOW = 3
 """Windows in a row that a unit is slow at least."""
@@ -49,7 +49,7 @@ class Delivery(NamedTuple):
     rate: float | None
     """Usual messages per second, Hz. None: too few messages."""
     slow_from: float | None = None
-    """Start of the longest time at less than `SLOW` of its rate, s. None: no such time."""
+    """Start of the longest time at less than `SLOW_SHARE` of its rate, s. None: no such time."""
     slow_to: float | None = None
     """End of that time, s. None: it lasts to the end, or there is no such time."""
     slow_rate: float | None = None
@@ -63,7 +63,7 @@ class Deliveries:
         """``start``: time of the first message that is counted, s."""
         self._counts = np.zeros((topics, MOST_WINDOWS), dtype=np.int64)
         self._start = start
-        self._width = WINDOW
+        self._width = FIRST_WINDOW
         self._first: int | None = None
         """Time of recording of the first message, ns."""
         self._last = 0
@@ -133,7 +133,7 @@ def _delivery(shares: Array, times: Array, width: float, rate: float) -> Deliver
     if not len(shares):
         return Delivery(1.0, None)
     share = float(shares.mean())
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], shares < SLOW, [0]])))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], shares < SLOW_SHARE, [0]])))
     runs = edges.reshape(-1, 2)
     longest = max(runs.tolist(), key=lambda run: run[1] - run[0], default=[0, 0])
     first, last = longest

@@ -28,7 +28,7 @@ from fdi_ros.replay.episodes import DECLARED
 
 ALONE = (ChannelState.FAULTY, ChannelState.STALE)
 """States of a channel that is declared alone."""
-STANDING = (*ALONE, ChannelState.AMBIGUOUS)
+DECLARED_STATES = (*ALONE, ChannelState.AMBIGUOUS)
 """States of a declared channel, alone or in a set."""
 
 
@@ -473,7 +473,7 @@ class Evaluation:
         if event.after in (ChannelState.OK, ChannelState.UNCHECKED):
             self._declared.pop(event.channel, None)
         if (
-            event.after not in STANDING
+            event.after not in DECLARED_STATES
             or self._declared.get(event.channel) == event.after
         ):
             # A declared channel that was silent for a while is not declared anew.

@@ -85,7 +85,7 @@ class Words(NamedTuple):
     level: str
 
 
-WORDS = {
+QUANTITY_WORDS = {
     RATE: Words(
         "fused rate",
         "statistic, and threshold",
@@ -138,7 +138,7 @@ class Curves:
     ) -> None:
         self.names = geometry.channel_names
         self.unit = unit
-        self._words = WORDS[quantity]
+        self._words = QUANTITY_WORDS[quantity]
         self._own = own
         norm = np.linalg.norm(geometry.axes, axis=1)
         self._sees = np.abs(geometry.axes) >= SEES_AXIS * norm[:, None]
@@ -726,7 +726,7 @@ MOST_MARKS = 200
 """Largest number of marked declarations."""
 IN_VIEW = 1.0
 """Time after the begin and the detection of a fault that the scale of residuals covers, s."""
-STATES = {
+STATE_STYLES = {
     "OK": ("#8fbf9f", ""),
     "SUSPECT": ("#e6c84f", "slashes"),
     "AMBIGUOUS": ("#e08a3c", "crosses"),
@@ -783,7 +783,7 @@ def _timeline(
             "pattern": pattern,
             **spans[state],
         }
-        for state, (colour, pattern) in STATES.items()
+        for state, (colour, pattern) in STATE_STYLES.items()
         if state in spans
     ]
     layout = time_layout(36 + 24 * len(names), rows=list(names), title="States")

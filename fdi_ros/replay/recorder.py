@@ -61,6 +61,7 @@ _DECLARED, _EPISODE_STATES, _HIDING = (
 )
 """States with a declaration, states of an episode, and states that hide a declaration."""
 
+#: Episodes with details. Further ones are only counted.
 MOST_EPISODES = 1000
 MOST_EPISODE_STEPS = 20
 """Largest number of steps of an episode. The last step is always kept."""
@@ -436,7 +437,10 @@ class Recorder:
             sizes.items(),
             key=lambda item: abs(item[1].rad_s) / (item[1].std_rad_s or np.inf),
         )
-        if set(pair) != one.members and abs(size.rad_s) < CERTAIN * size.std_rad_s:
+        if (
+            set(pair) != one.members
+            and abs(size.rad_s) < CERTAIN_TREND * size.std_rad_s
+        ):
             return None
         names = tuple(self._geometry.channel_names[i] for i in pair)
         return Apart(names, one_of_words(self._geometry, pair), size)
@@ -524,24 +528,24 @@ def _stds(output: Output) -> Array:
 # Size and course of an error, in bounded memory
 
 
-MOST = 512
+MOST_BATCHES = 512
 """Largest number of batches. If exceeded, neighbours are merged."""
 FIRST_WIDTH = 0.1
 """Width of a batch at first, s."""
 LONGER = 12
 """Number of merged batches for the standard error. An error is correlated for a shorter time."""
-FEW = 4
+FEWEST_BATCHES = 4
 """Smallest number of batches with a meaningful scatter."""
-CERTAIN = 4.0
+CERTAIN_TREND = 4.0
 """Standard errors from which on a trend is significant."""
 TREND = 0.3
 """Smallest change of a trend, as a share of the size."""
 PASSED = 0.25
 """Share of its former size below which an error is over."""
-LASTING = 1.0
+SIZE_TIME = 1.0
 """Time over which the size at the declaration is averaged, s. Also the time for which an error must
 stay below `PASSED` to be over."""
-ROUNDING = 1e-12
+ROUNDING_SHARE = 1e-12
 """Share of a mean square that is rounding error."""
 SMALL = 0.5
 """Ratio of mean to scatter below which the error is not described by its mean."""
@@ -573,7 +577,7 @@ class Batches:
         self._bias = bias
         self._width = FIRST_WIDTH
         # Number of samples, sum, sum of squares of each batch.
-        self._sums = np.zeros((3, MOST))
+        self._sums = np.zeros((3, MOST_BATCHES))
         self._with_rate = np.zeros(
             2
         )  # sum of error times rate, and of the squared rate
@@ -586,15 +590,18 @@ class Batches:
         rate = np.nan_to_num(rate[known])
         if not len(time):
             return
-        while time[-1] - self._begin >= MOST * self._width:
+        while time[-1] - self._begin >= MOST_BATCHES * self._width:
             self._sums = np.hstack(
-                [self._sums.reshape(3, -1, 2).sum(axis=2), np.zeros((3, MOST // 2))]
+                [
+                    self._sums.reshape(3, -1, 2).sum(axis=2),
+                    np.zeros((3, MOST_BATCHES // 2)),
+                ]
             )
             self._width *= 2
         number = np.maximum(((time - self._begin) / self._width).astype(np.intp), 0)
-        number = np.minimum(number, MOST - 1)
+        number = np.minimum(number, MOST_BATCHES - 1)
         for k, values in enumerate((None, error, error**2)):
-            self._sums[k] += np.bincount(number, values, MOST)
+            self._sums[k] += np.bincount(number, values, MOST_BATCHES)
         self._with_rate += float(error @ rate), float(rate @ rate)
 
     def size(self, declared: float) -> Size | None:
@@ -611,7 +618,7 @@ class Batches:
         whole = float(total.sum() / count.sum())
         mean_square = float(square.sum() / samples)
         scatter = mean_square - whole**2
-        scatter = scatter if scatter > ROUNDING * mean_square else 0.0
+        scatter = scatter if scatter > ROUNDING_SHARE * mean_square else 0.0
         lasting = math.hypot(
             self._scale * math.sqrt(float(self._with_rate[1]) / samples), self._bias
         )
@@ -629,7 +636,7 @@ class Batches:
             return Size(
                 rms, chance, "proportional", last, share_of_rate=product / rates
             )
-        at = (middle >= declared) & (middle < declared + max(LASTING, self._width))
+        at = (middle >= declared) & (middle < declared + max(SIZE_TIME, self._width))
         here = mean[at] if at.any() else mean[-1:]
         then = float(here.mean())
         gone = self._gone(used, mean, then)
@@ -648,8 +655,8 @@ class Batches:
             chance = float(straight.std(ddof=2)) / math.sqrt(len(here))
             return Size(then, math.hypot(chance, lasting), course, last, slope)
         if abs(whole) < SMALL * math.sqrt(scatter):
-            wander = float(mean.var()) if len(mean) >= FEW else 0.0
-            if wander > max(0.5 * scatter, (CERTAIN * std) ** 2):
+            wander = float(mean.var()) if len(mean) >= FEWEST_BATCHES else 0.0
+            if wander > max(0.5 * scatter, (CERTAIN_TREND * std) ** 2):
                 return Size(rms, std, "varying", last)
             if scatter > (LOUD * self._noise) ** 2:
                 return Size(rms, rms / math.sqrt(2.0 * samples), "noisy", last)
@@ -662,7 +669,7 @@ class Batches:
             return None
         since = self._begin + (used[large[-1]] + 1) * self._width
         lasted = self._begin + (used[-1] + 1) * self._width - since
-        return float(since) if lasted >= max(LASTING, 2 * self._width) else None
+        return float(since) if lasted >= max(SIZE_TIME, 2 * self._width) else None
 
 
 def _standard_error(means: Array, scatter: float, samples: float) -> float:
@@ -673,16 +680,18 @@ def _standard_error(means: Array, scatter: float, samples: float) -> float:
     by_sample = scatter / max(samples, 1.0)
     if len(means) >= 2 * LONGER:
         means = np.array([part.mean() for part in np.array_split(means, LONGER)])
-    by_batch = float(means.var(ddof=1)) / len(means) if len(means) >= FEW else 0.0
+    by_batch = (
+        float(means.var(ddof=1)) / len(means) if len(means) >= FEWEST_BATCHES else 0.0
+    )
     return math.sqrt(max(by_sample, by_batch))
 
 
 def _trend(time: Array, mean: Array) -> float | None:
     """Return the slope of a straight line through the means (k,). None: not significant."""
-    if len(mean) < 2 * FEW:
+    if len(mean) < 2 * FEWEST_BATCHES:
         return None
     x = time - time.mean()
     slope = float(x @ mean / (x @ x))
     rest = mean - mean.mean() - slope * x
     std = math.sqrt(float(rest @ rest) / (len(mean) - 2) / float(x @ x))
-    return slope if abs(slope) > CERTAIN * std else None
+    return slope if abs(slope) > CERTAIN_TREND * std else None

@@ -35,7 +35,7 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.soundness import RateHealth, UnitHealth, own_noise
 from fdi_ros.monitor.status import ChannelStatus, Status
-from fdi_ros.replay.episodes import GAP, Story, join_halves, pieces
+from fdi_ros.replay.episodes import STRETCH_GAP, Story, join_halves, pieces
 from fdi_ros.replay.health import Deliveries, Values, with_context, with_delivery
 from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
@@ -51,7 +51,7 @@ from fdi_ros.replay.summary import (
     StreamResult,
     Summary,
 )
-from fdi_ros.replay.verdict import LASTING, verdict_of
+from fdi_ros.replay.verdict import SILENT_TO_END, verdict_of
 
 OnProgress = Callable[[float], None]
 """Called with the share done, 0 to 1."""
@@ -129,9 +129,9 @@ class Walk:
         """Cut a block at gaps. The caller feeds each piece before the next one."""
         if not len(block):
             yield block
-        for rows in pieces(block.stamp, GAP):
+        for rows in pieces(block.stamp, STRETCH_GAP):
             first = int(block.stamp[rows.start])
-            if self._last is not None and first - self._last > GAP * 1e9:
+            if self._last is not None and first - self._last > STRETCH_GAP * 1e9:
                 self.begin_stretch(first)
             self._last = int(block.stamp[rows.stop - 1])
             yield block[rows]
@@ -419,7 +419,7 @@ def _doubt_words(state: str, since: float | None, reason: str, end: float) -> st
     """Return why an undeclared channel is not used at the end. Empty: it is used."""
     if state == "EXCLUDED":
         return f"remained left out: {reason}"
-    if state != "SUSPECT" or since is None or end - since < LASTING:
+    if state != "SUSPECT" or since is None or end - since < SILENT_TO_END:
         return ""
     return f"remained suspected from {since:.1f} s to the end ({reason})"
 

@@ -30,7 +30,13 @@ from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import pieces
-from fdi_ros.replay.outcomes import STANDING, Scored, StateChange, score, standing
+from fdi_ros.replay.outcomes import (
+    DECLARED_STATES,
+    Scored,
+    StateChange,
+    score,
+    standing,
+)
 from fdi_ros.replay.run import Judge, Kept, Walk
 from fdi_ros.replay.summary import Judgement
 from fdi_ros.system.jobs import run_jobs
@@ -213,7 +219,7 @@ def watch_baseline(pipeline: Pipeline, block: Block, start: float = 0.0) -> Base
         )
 
     def what_counts(output: Output) -> tuple[Mask, Mask, Array]:
-        doubtful = np.asarray(np.isin(output.state, STANDING).any(axis=1))
+        doubtful = np.asarray(np.isin(output.state, DECLARED_STATES).any(axis=1))
         return (
             np.isfinite(output.threshold),
             doubtful,

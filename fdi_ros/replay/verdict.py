@@ -27,7 +27,7 @@ from fdi_ros.system.text import figures, first_of, listed
 
 LEAST_JUDGED = 0.5
 """Share of the samples that must be judged for a verdict."""
-LASTING = 1.0
+SILENT_TO_END = 1.0
 """Time to the end for which a channel must be silent or unchecked to be reported, s."""
 BRIEF = 1.0
 """A fault that stands for less is reported with its duration, s."""
@@ -76,7 +76,7 @@ def faulty_episodes(judgement: Judgement) -> list[Episode]:
         one
         for one in judgement.story.episodes
         if one.stands
-        and one.duration_s >= LASTING
+        and one.duration_s >= SILENT_TO_END
         and one.evidence.reason == Reason.NO_DATA.value
         and not one.declares
     ]
@@ -156,7 +156,8 @@ def _healthy_words(judgement: Judgement) -> str:
     end = [
         one.name
         for one in judgement.unchecked_channels
-        if one.since_s is not None and judgement.scores.end_s - one.since_s >= LASTING
+        if one.since_s is not None
+        and judgement.scores.end_s - one.since_s >= SILENT_TO_END
     ]
     more = f"; not checked at the end: {listed(end)}" if end else ""
     return (

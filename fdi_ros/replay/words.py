@@ -25,8 +25,8 @@ from fdi_ros.replay.episodes import (
 from fdi_ros.replay.outcomes import Outcome, Scores
 from fdi_ros.replay.summary import ChannelResult, SampleRate, Summary
 from fdi_ros.replay.verdict import (
-    LASTING,
     MOST_CONCERNS,
+    SILENT_TO_END,
     noise_behind,
     silent_units,
     unjudged_words,
@@ -50,7 +50,7 @@ AUTOPILOT_LOGS = (".bin", ".tlog")
 """Suffixes of the logs of ArduPilot."""
 FOLDED = 4
 """Episodes without data for one reason from which on a terminal shows them as one."""
-MOST_EPISODES = 20
+SHOWN_EPISODES = 20
 """Episodes that a terminal shows with all their details."""
 
 
@@ -88,7 +88,7 @@ def _beside_silence(summary: Summary) -> list[Concern]:
         if one.name in silent
         and one.slow_to_s is None
         and one.slow_from_s is not None
-        and one.slow_from_s >= silent[one.name] - LASTING
+        and one.slow_from_s >= silent[one.name] - SILENT_TO_END
     }
     return [
         one
@@ -135,7 +135,7 @@ def _unchecked_lines(summary: Summary) -> list[str]:
         for one in summary.unchecked_channels
         if one.unit not in silent
         and one.since_s is not None
-        and summary.scores.end_s - one.since_s >= LASTING
+        and summary.scores.end_s - one.since_s >= SILENT_TO_END
     ]
     return [f"Not checked at the end: {unchecked_words(lost)}."] if lost else []
 
@@ -395,7 +395,7 @@ def _episodes(story: Story, scored: bool, unit: Unit) -> str:
     """List the episodes: channels, time and size, then the details."""
     silent, folded = _folded(story)
     shown_ones = [one for one in story.episodes if one not in silent]
-    first = shown_ones[:MOST_EPISODES]
+    first = shown_ones[:SHOWN_EPISODES]
     lines = ["\nwhat happened\n"] if first else []
     for place, one in enumerate(first, 1):
         where = f" (stretch {one.stretch})" if len(story.stretches) > 1 else ""

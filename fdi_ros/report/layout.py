@@ -538,6 +538,7 @@ BYTES = 600_000
 """Largest size of the series of a page as text, bytes."""
 FINE, SMALL = "f4", "f2"
 """Kinds of a series: 24 bits for values that are compared, 11 bits (0.05 %) for others."""
+#: largest finite number of 16 bits
 LARGEST_HALF = 65504.0
 
 

@@ -45,7 +45,7 @@ from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import (
     DIAGNOSTICS,
     INPUT,
-    WHOLE,
+    MONITOR_LINE,
     Level,
     StatusLine,
     encode_diagnostics,
@@ -282,7 +282,7 @@ class AutopilotNode(CheckedNode):
         except ValueError:
             # The monitor has no such level.
             return
-        whole = next((line for line in lines if line.name == WHOLE), None)
+        whole = next((line for line in lines if line.name == MONITOR_LINE), None)
         due = (
             self._sends_values
             and self._vehicle.in_reach

@@ -38,7 +38,7 @@ from fdi_ros.ros.running import Running
 from fdi_ros.system.text import shown
 
 CHECK_PERIOD = 0.05  # period of the checks for silence and of saving a changed state, s
-LATE = 2  # periods after which the timer is not waited for any longer: the executor's queue is full
+LATE_PERIODS = 2  # periods after which the timer is not waited for any longer: the executor's queue is full
 # stamps beyond all clocks, ns: a clock was set back by decades again and again
 END_OF_TIME = 2**62
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -193,7 +193,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
         super().keep_up()
         if (
             self._running is not None
-            and time.monotonic() - self._checked_at > LATE * CHECK_PERIOD
+            and time.monotonic() - self._checked_at > LATE_PERIODS * CHECK_PERIOD
         ):
             self.inputs.drain()
             self._check(self._running)

@@ -49,7 +49,7 @@ REPORT_PERIOD = 1.0  # from one regular report of a node to the next, s
 # Most lines of the log of one severity in a `REPORT_PERIOD`: lines that anybody can
 # cause with requests must not hide a declaration.
 MOST_LINES = 20
-LONGEST = 0.05  # longest turn, s: reports and requests do not wait for a flood
+LONGEST_TURN = 0.05  # longest turn, s: reports and requests do not wait for a flood
 FLOOD = 5000  # events that may wait in the queue of an executor: some 50 ms of its work, 1 MB
 # time after the start of a flood before the first check for its end, s
 FLOOD_TIME = 5.0
@@ -65,6 +65,7 @@ _POLICIES = {
     "depth": (),
     "reliability": ("reliable", "best_effort", "system_default"),
 }  # QoS policies that may be overridden, and their values
+# of a queue: 100 s at 1 kHz
 _MAX_DEPTH = 100_000
 
 
@@ -212,10 +213,10 @@ class InputQueue:
         self._waiting = 0
 
     def drain(self) -> None:
-        """Take waiting messages in the order of their arrival, for `LONGEST` or two full queues at most."""
+        """Take waiting messages in the order of their arrival, for `LONGEST_TURN` or two full queues at most."""
         takers = list(self.subscriptions.items())
         taken = 0
-        end = time.monotonic() + LONGEST
+        end = time.monotonic() + LONGEST_TURN
         heads = [_next(one) for one, _ in takers]
         while waiting := [
             (head[0], k, head[1]) for k, head in enumerate(heads) if head is not None

@@ -24,7 +24,7 @@ from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.signals import heeded
 from fdi_ros.system import BAGS, require
 
-TIMEOUT = 0.1  # longest turn of the executor, s, which delays a signal. The EventsExecutor needs a limit to work
+LONGEST_SPIN = 0.1  # longest turn of the executor, s, which delays a signal. The EventsExecutor needs a limit to work
 ROS_ARGUMENTS = (
     "--params-file",
     "--param",
@@ -68,7 +68,7 @@ def spin(node: Any, stop: Stop) -> None:
     try:
         while rclpy.ok() and not stop.asked:
             with guarded(node):
-                executor.spin_once(timeout_sec=TIMEOUT)
+                executor.spin_once(timeout_sec=LONGEST_SPIN)
                 if single:
                     node.inputs.drain()
                 else:

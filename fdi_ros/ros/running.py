@@ -20,14 +20,14 @@ from fdi_ros.core.live import (
     HAS_RATE,
     MALFORMED,
     MORE,
-    NEVER,
+    NO_STAMP,
     SUPPLY,
     WORKED,
 )
 from fdi_ros.core.messages import LAST_STAMP, frame_of
 from fdi_ros.monitor.diagnostics import (
+    MONITOR_LINE,
     OLD,
-    WHOLE,
     InputStatus,
     Level,
     StatusLine,
@@ -48,7 +48,7 @@ from fdi_ros.monitor.status import ApartStatus, Status
 from fdi_ros.ros.node import OVERRIDABLE, REPORT_PERIOD, BoundedLog, CheckedNode
 from fdi_ros.system.text import LINE, figures, shown
 
-REMEMBERED = 4096  # samples whose latency is remembered
+KEPT_LATENCIES = 4096  # samples whose latency is remembered
 MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood
 LATE_SAMPLE = 0.5
 """Age from which the newest judged sample is reported, s: several times the time that the slowest link and the
@@ -192,7 +192,7 @@ class InputTopic:
             arrives=watchdog.seconds(now) < ARRIVES,
             lag=max(lag, 0) / 1e9,
             max_lag=receiver.source.max_lag,
-            offset=None if stamp == NEVER else (watchdog.at - stamp) / 1e9,
+            offset=None if stamp == NO_STAMP else (watchdog.at - stamp) / 1e9,
             counts=counts,
             recent={
                 kind: count - self._reported_counts.get(kind, 0)
@@ -271,7 +271,7 @@ class InputTopic:
         """Restart the counts of recent messages at the clock time now, ns."""
         self._watchdog.measure(int(self._inlet["received"]), now)
         self._reported_counts = self._receiver.counts(self._number)
-        self._inlet["lag"] = NEVER
+        self._inlet["lag"] = NO_STAMP
 
 
 class Running:
@@ -289,7 +289,7 @@ class Running:
             for output in OUTPUTS
         }
         self._diagnostics = node.create_diagnostics()
-        self._latencies: deque[int] = deque(maxlen=REMEMBERED)
+        self._latencies: deque[int] = deque(maxlen=KEPT_LATENCIES)
         self.start(receiver)
 
     def start(self, receiver: Receiver) -> None:
@@ -516,7 +516,10 @@ class Running:
             hardware = self.receiver.pipeline.config.hardware_id
             lines = [
                 StatusLine(
-                    Level.STALE, prefix + WHOLE, "inactive: not monitoring", hardware
+                    Level.STALE,
+                    prefix + MONITOR_LINE,
+                    "inactive: not monitoring",
+                    hardware,
                 )
             ]
         else:

@@ -27,7 +27,13 @@ from sensor_msgs.msg import Imu
 from fdi_ros.config.config import is_plain_name
 from fdi_ros.errors import FdiError
 from fdi_ros.model.quantity import FORCE, RATE
-from fdi_ros.monitor.diagnostics import INPUT, WHOLE, Level, StatusLine, parse_number
+from fdi_ros.monitor.diagnostics import (
+    INPUT,
+    MONITOR_LINE,
+    Level,
+    StatusLine,
+    parse_number,
+)
 from fdi_ros.monitor.output import ChannelState
 from fdi_ros.ros.node import read_diagnostics
 from fdi_ros.system.text import LINE, figures, shown
@@ -43,17 +49,17 @@ try:
 except ImportError:
     CAN_DRAW = False
 
-PERIOD = 0.1  # how often the view is drawn, s
+DRAWING_PERIOD = 0.1  # how often the view is drawn, s
 REGULAR = 10.0  # line by line, the state of the whole is reported at least so often, s
 SERVICE = "/relearn_bias"  # a monitor has this service, before the node is configured
 SETTLE = 1.0  # monitors appear one by one: time until one counts as the only one, s
-STATES = {state.name for state in ChannelState}
+STATE_NAMES = {state.name for state in ChannelState}
 DEEP = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
-SILENT = {
+SILENT_AFTER = {
     "fused": 1.0,
     "diagnostics": 3.0,
 }  # age from which a message is no longer shown, s
-REMEMBERED = 50  # changes of state that were not reported yet, or may be drawn
+KEPT_CHANGES = 50  # changes of state that were not reported yet, or may be drawn
 COLOURS = {
     Level.OK: "green",
     Level.WARN: "yellow",
@@ -63,7 +69,7 @@ COLOURS = {
 GREY = "bright_black"
 SCALES = tuple(digit * 10.0**power for power in range(-2, 3) for digit in (2, 5, 10))
 """Ends of a residual bar, in the unit of the channel. The least is above the noise of healthy channels."""
-LATEST = 8  # changes of state that are drawn
+SHOWN_CHANGES = 8  # changes of state that are drawn
 WIDE = 90  # columns from which the biases have room
 
 
@@ -86,7 +92,7 @@ class Picture:
         default_factory=time.monotonic
     )  # start of the wait, s, monotonic clock
     whole: StatusLine = field(
-        default_factory=lambda: StatusLine(Level.STALE, WHOLE, "")
+        default_factory=lambda: StatusLine(Level.STALE, MONITOR_LINE, "")
     )
     channels: Mapping[str, StatusLine] = field(default_factory=dict)  # by name
     inputs: Sequence[StatusLine] = ()
@@ -94,11 +100,11 @@ class Picture:
     heard: dict[str, float] = field(
         default_factory=dict
     )  # when the last message of each kind came, s, monotonic clock
-    changes: deque[Change] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    changes: deque[Change] = field(default_factory=lambda: deque(maxlen=KEPT_CHANGES))
 
     def is_silent(self, kind: str) -> bool:
         """Whether messages of a kind have stopped, or never came."""
-        return time.monotonic() - self.heard.get(kind, -math.inf) > SILENT[kind]
+        return time.monotonic() - self.heard.get(kind, -math.inf) > SILENT_AFTER[kind]
 
     @property
     def evidence(self) -> tuple[float, float] | None:
@@ -241,11 +247,11 @@ class Watcher(Node):
         with contextlib.suppress(ValueError):
             found = read_diagnostics(message, picture.monitor)
         channels = {line.name: line for line in found if line.value("state")}
-        if found and STATES.issuperset(
+        if found and STATE_NAMES.issuperset(
             line.value("state") for line in channels.values()
         ):
             picture.whole = next(
-                (line for line in found if line.name == WHOLE), picture.whole
+                (line for line in found if line.name == MONITOR_LINE), picture.whole
             )
             picture.inputs = [
                 line._replace(name=line.name.removeprefix(INPUT))
@@ -296,7 +302,7 @@ def show(
     with showing as show_once:
         while not is_over:
             watcher.look()
-            end = time.monotonic() + PERIOD
+            end = time.monotonic() + DRAWING_PERIOD
             while (left := end - time.monotonic()) > 0:
                 executor.spin_once(timeout_sec=left)
             is_over = over()
@@ -401,7 +407,7 @@ def draw(picture: Picture, width: int) -> Group:
         *_input_lines(picture),
         Text(),
     ]
-    for change in list(picture.changes)[: -LATEST - 1 : -1]:
+    for change in list(picture.changes)[: -SHOWN_CHANGES - 1 : -1]:
         at = Text(time.strftime("%H:%M:%S  ", time.localtime(change.at)), style=GREY)
         parts.append(at.append(change.words, style=COLOURS[change.level]))
     return Group(*parts)

@@ -27,7 +27,7 @@ from fdi_ros.inspection.turns import (
     LEAST_WINDOWS,
     SHARED,
     SQUARE,
-    WINDOW,
+    TURN_WINDOW,
     angle_of,
     find_turn,
 )
@@ -284,7 +284,7 @@ LARGEST_DOUBT = SQUARE
 #: a mount less certain than this, in any direction, is not shown
 LARGEST_ERROR = np.radians(2.0)
 #: standard errors from which a delay or a mount off the axes is shown
-SHOWN = 3.0
+SHOWN_ERRORS = 3.0
 
 
 @dataclass(frozen=True)
@@ -331,7 +331,7 @@ def _against(first: Array, unit: Array) -> Mount:
     """Return the mount of a unit with rates (W, 3) against the first one (W, 3), rad/s."""
     if len(unit) < LEAST_WINDOWS:
         return Mount(
-            f"NOT KNOWN: all units give values together for only {len(unit) * WINDOW:.0f} s"
+            f"NOT KNOWN: all units give values together for only {len(unit) * TURN_WINDOW:.0f} s"
         )
     most, second = np.sqrt(
         np.maximum(np.linalg.eigvalsh(unit.T @ unit / len(unit)), 0.0)
@@ -370,7 +370,7 @@ def _against(first: Array, unit: Array) -> Mount:
     # Of all signed axes, a mirrored one is never the nearest.
     nearest = min(SIGNED_AXES, key=lambda axes: float(np.linalg.norm(axes - rotation)))
     off = angle_of(nearest.T @ rotation)
-    if off > max(SQUARE, SHOWN * doubt):
+    if off > max(SQUARE, SHOWN_ERRORS * doubt):
         words = f"turned by {np.degrees(angle_of(rotation)):.1f} +- {np.degrees(error):.1f} deg"
         return Mount(words, shared, np.round(rotation, 6), 0.0, error)
     error = max(error, doubt)

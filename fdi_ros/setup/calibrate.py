@@ -46,7 +46,7 @@ from fdi_ros.setup.accelerometers import (
     fit_accelerometers,
     prepare_accelerometers,
 )
-from fdi_ros.setup.agreement import LEAST_RATE, SHOWN, check_agreement
+from fdi_ros.setup.agreement import LEAST_RATE, SHOWN_ERRORS, check_agreement
 from fdi_ros.setup.blocks import (
     NOT_SHIFTED,
     Data,
@@ -102,7 +102,7 @@ class StampDelay(NamedTuple):
     @property
     def shown(self) -> bool:
         """Whether the data show one."""
-        return abs(self.value) > SHOWN * self.error
+        return abs(self.value) > SHOWN_ERRORS * self.error
 
 
 class Span(NamedTuple):
@@ -489,7 +489,9 @@ def _settings(
         )
     if source.stamped:
         total = np.array(source.delays)
-        shown = np.abs(found.delay) > np.maximum(LEAST_SKEW, SHOWN * found.delay_std)
+        shown = np.abs(found.delay) > np.maximum(
+            LEAST_SKEW, SHOWN_ERRORS * found.delay_std
+        )
         # Of all channels of a unit the first is taken.
         units, first = np.unique(
             [source.chip_of(int(channel)) for channel in active], return_index=True
@@ -524,7 +526,7 @@ def _nonlinearity(before: NoiseModel, active: Int, found: StateEstimate) -> Arra
     """
     usual = before.nonlinearity_std[active]
     shown = found.nonlinearity
-    sure = shown.is_measured and shown.value > SHOWN * shown.error
+    sure = shown.is_measured and shown.value > SHOWN_ERRORS * shown.error
     return np.maximum(usual, shown.value if sure else 0.0)
 
 

@@ -35,7 +35,7 @@ from fdi_ros.estimator.error_states import (
     prepare_layout,
 )
 from fdi_ros.estimator.estimator import LONG_TIME, REST_BLOCKS
-from fdi_ros.estimator.rest import QUIET, REST_STD, UNLEARNED, rests
+from fdi_ros.estimator.rest import REST_RATIO, REST_STD, UNLEARNED, rests
 from fdi_ros.estimator.shared_noise import UNEQUAL
 from fdi_ros.model.geometry import spans_space
 from fdi_ros.model.samples import Array, Int, Mask
@@ -65,6 +65,7 @@ from fdi_ros.setup.smoother import (
 SCALE_STD = 0.008
 #: The same for reference channels, whose axes are taken as configured.
 REFERENCE_STD = 1e-6
+#: Passes over a recording. They end earlier once nothing changes any more.
 MOST_PASSES = 12
 TRUSTING = MOST_PASSES // 3
 """First passes, which take all motion for motion, because unknown delays and scale
@@ -81,7 +82,7 @@ LARGEST_DELAY = PARAMETERS["imus.delays"].high
 #: largest change of a delay in one pass, s, as slopes hold for nearby motion only
 STEP_DELAY = 2.0 * UNIT_DELAY
 #: variance of a channel that is not there, (rad/s)^2
-ABSENT = 1e12
+ABSENT_VARIANCE = 1e12
 #: largest distance between means of windows at rest, in standard deviations
 SAME_REST = 5.0
 #: largest ratio of the noise in motion to the noise that is written
@@ -297,7 +298,7 @@ class _Pass:
         #: number of constants that motion shows, the first of all
         self.motion = 3 * len(axes) + sensors.units - 1
         y, moment = self._noise_of_windows()
-        steady = np.where(self.present, moment, ABSENT)
+        steady = np.where(self.present, moment, ABSENT_VARIANCE)
         gain = gains(steady, axes)
         # Expand the biases of joined windows to all windows.
         each = -(-blocks.windows // len(biases))
@@ -315,7 +316,7 @@ class _Pass:
         self.still: Mask = self.rest if own else np.zeros_like(self.rest)
         # (W, n) of a block, (rad/s)^2, coloured noise counted in.
         factor = np.where(self.rest[:, None], colour[0], colour[1])
-        self.variance: Array = np.where(self.present, moment * factor, ABSENT)
+        self.variance: Array = np.where(self.present, moment * factor, ABSENT_VARIANCE)
         acceleration = self._accelerations()
         self._join_windows()
         self.evidence, self.careful = self._find_evidence(
@@ -416,10 +417,10 @@ class _Pass:
         rate = self.rate
         found = np.zeros(self.blocks.windows, dtype=bool)
         noise = np.einsum(
-            "wai,wi->wa", gain**2, np.where(variance < ABSENT, variance, 0.0)
+            "wai,wi->wa", gain**2, np.where(variance < ABSENT_VARIANCE, variance, 0.0)
         )
         level = levels(blocks.samples, self.sampled, self.axes)
-        quiet = level < QUIET * np.average(level[self.floor.windows])
+        quiet = level < REST_RATIO * np.average(level[self.floor.windows])
         unlearned = np.full(3, UNLEARNED**2 if known else 0.05**2)
         for w in (
             np.flatnonzero(quiet & (blocks.size == REST_BLOCKS))
@@ -531,7 +532,7 @@ class _Pass:
             if self.rest.any()
             else np.zeros(len(self.axes))
         )
-        there = (variance < ABSENT / 2) & moving[:, None]
+        there = (variance < ABSENT_VARIANCE / 2) & moving[:, None]
         beyond = np.where(there, np.maximum(variance - at_rest, 0.0), 0.0)
         share = (beyond / variance).max(axis=1)[:, None]
         most = np.zeros((len(moments), BASE))

@@ -60,7 +60,7 @@ SMOOTHING = np.array([1.0, 4.0, 1.0]) / 6.0
 #: fewest blocks of a window in use, and fewest such windows
 LEAST_BLOCKS = LEAST_WINDOWS = 5
 #: angular acceleration over its noise, in power, from which a window turns
-TURNING = 3.0
+TURNING_POWER = 3.0
 #: fits, each with the noise that the one before left in every window
 ROUNDS = 3
 #: Numbers of states: the walking bias; and bias, position (3), scale and mount errors
@@ -223,7 +223,7 @@ def _windows_of(
     of_noise /= FORCE.natural**2
     power = (signals[:, :, 3:6] ** 2).sum(axis=(1, 2))
     power = np.add.reduceat(power, blocks.start) / np.maximum(count, 1)
-    turns = power > TURNING * np.trace(of_noise, axis1=1, axis2=2)
+    turns = power > TURNING_POWER * np.trace(of_noise, axis1=1, axis2=2)
     signals[:, :, 3:6] *= turns[blocks.window][:, None, None]
     moments = np.add.reduceat(np.einsum("bas,bat->bst", signals, signals), blocks.start)
     moments[:, 3:6, 3:6] -= (count * turns)[:, None, None] * of_noise

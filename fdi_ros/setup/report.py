@@ -43,7 +43,7 @@ from fdi_ros.report.layout import (
     told,
 )
 from fdi_ros.setup.accelerometers import AccelerometerFit
-from fdi_ros.setup.agreement import SHOWN
+from fdi_ros.setup.agreement import SHOWN_ERRORS
 from fdi_ros.setup.blocks import flag_runs
 from fdi_ros.setup.calibrate import Calibration, Span, StampDelay
 from fdi_ros.setup.channels import UNMEASURED, ChannelFit
@@ -65,7 +65,7 @@ from fdi_ros.system.text import LINE, figures, first_of, shown
 #: shown
 SHOWN_AXES = UNMEASURED / 2
 #: part of a recording that supports its noise
-LEAST_SHARE = 0.2
+LEAST_SUPPORT = 0.2
 #: of axes against nominal, that are worth a look
 LARGE_ANGLE, LARGE_SCALE = (
     float(np.radians(5.0)),
@@ -156,7 +156,7 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
             names,
             delay.value,
             delay.error,
-            SHOWN * delay.error,
+            SHOWN_ERRORS * delay.error,
         )
 
 
@@ -226,9 +226,9 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
         words += f" {unit.name}), and noise_std is from the quietest motion. Let the vehicle stand still for 10 s,"
         words += " motors off"
         yield Finding(Role.UNKNOWN, "rest", words, error=common)
-    elif share <= LEAST_SHARE:
+    elif share <= LEAST_SUPPORT:
         words = f"noise_std is from the quietest {share:.0%} of the recording: a longer rest gives a better value"
-        yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=LEAST_SHARE)
+        yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=LEAST_SUPPORT)
     error = result.axis_errors
     rms = np.std(found.rate, axis=0) * unit.factor
     if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:

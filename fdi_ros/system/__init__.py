@@ -82,7 +82,7 @@ PROGRESS = ("tqdm",)
 #: libraries that share work among processes
 POOL = (*PROGRESS, "joblib")
 #: of setup.py, for every installation by pip
-REQUIRED = (*BAGS, *POOL)
+REQUIREMENTS = (*BAGS, *POOL)
 #: names on PyPI, where they differ from the names to import
 PACKAGES = {"serial": "pyserial"}
 

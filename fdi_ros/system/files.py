@@ -49,9 +49,9 @@ RECORDS, RECORD_BYTES = 300_000, 4096
 record.
 """
 #: topics of one recording, and descriptions of topics and of types in one file
-CHANNELS = 4096
+MOST_TOPICS = 4096
 #: read from one chunk at most
-DESCRIPTIONS = 4 * CHANNELS
+DESCRIPTIONS = 4 * MOST_TOPICS
 #: of the description of a topic or a type
 DESCRIPTION_BYTES = 1 << 20
 #: characters of the name of a topic or a type, as in DDS
@@ -59,7 +59,7 @@ NAME = 255
 #: files of one recording, all open together
 FILES = 800
 #: latest time of recording, ns: the largest stamp of ROS 2, in 2038
-LATEST = 2**31 * 10**9 - 1
+LATEST_TIME = 2**31 * 10**9 - 1
 EARLIEST = 946_684_800 * 10**9
 """Earliest date, the year 2000, ns. Earlier times count from the start of a system."""
 LOG_SPAN = 10**13
@@ -79,6 +79,7 @@ ROS1_INDEX_BYTES = 48 << 20
 """Index of a ROS 1 bag, 12 bytes per message: an hour at 1100 messages per second."""
 #: of the line of names of a table of text
 CSV_LINE_BYTES = 1 << 20
+#: columns of a table, as many as topics
 CSV_COLUMNS = 4096
 STEPS, STEPS_PER_BYTE = 10_000_000, 20
 """SQLite steps that any query may take, plus this number per byte of the file."""

@@ -18,7 +18,7 @@ import numba
 import pytest
 
 from fdi_ros.compiling.cache import Kept as _Kept
-from fdi_ros.compiling.notice import WORDS, announced, refused
+from fdi_ros.compiling.notice import COMPILING, announced, refused
 from fdi_ros.errors import FdiError
 
 SCRIPT = """
@@ -313,13 +313,13 @@ def test_compiling_is_announced_before_or_refused(said):
     one, two = new_function(), new_function()
     with announced():
         one(1)
-    assert said.messages == [WORDS]
+    assert said.messages == [COMPILING]
     with announced(), refused("no"):
         one(1)
     with pytest.raises(FdiError, match=r"^not now$"), refused("not now"):
         two(1)
     assert two(1) == 2
-    assert said.messages == [WORDS]
+    assert said.messages == [COMPILING]
 
 
 def test_a_verb_says_it_before_its_result(tmp_path, root, flight):
@@ -331,7 +331,7 @@ def test_a_verb_says_it_before_its_result(tmp_path, root, flight):
         "NUMBA_CACHE_DIR": str(tmp_path),
         "NUMBA_BOUNDSCHECK": "1",
     }
-    for said in (WORDS, ""):
+    for said in (COMPILING, ""):
         done = subprocess.run(
             command,
             capture_output=True,

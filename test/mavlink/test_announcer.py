@@ -18,7 +18,7 @@ from fdi_ros.mavlink.report import (
     WARNING,
     Announcer,
 )
-from fdi_ros.monitor.diagnostics import WHOLE, Level, StatusLine
+from fdi_ros.monitor.diagnostics import MONITOR_LINE, Level, StatusLine
 
 NS = 1_000_000_000
 CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
@@ -186,7 +186,9 @@ def test_the_whole_is_told_too() -> None:
         ),
         (Level.STALE, "no sample for 3.0 s", [(CRITICAL, "FDI: no samples")]),
     ):
-        assert ground.hear(StatusLine(level, WHOLE, message), wait=3.0) == told, message
+        assert (
+            ground.hear(StatusLine(level, MONITOR_LINE, message), wait=3.0) == told
+        ), message
     assert ground.announcer.due(ground.now + 4 * NS) == []
     assert ground.announcer.due(ground.now + 5 * NS) == [
         (CRITICAL, "FDI: the monitor is silent")
@@ -198,8 +200,10 @@ def test_one_late_unit_is_no_loss_of_redundancy() -> None:
     ground = Ground()
     words = f"3 of 9 channels healthy; {NOTHING_SEEN}"
     for _ in range(3):
-        ground.hear(StatusLine(Level.ERROR, WHOLE, words), wait=0.9)
-        ground.hear(StatusLine(Level.OK, WHOLE, "9 of 9 channels healthy"), wait=0.5)
+        ground.hear(StatusLine(Level.ERROR, MONITOR_LINE, words), wait=0.9)
+        ground.hear(
+            StatusLine(Level.OK, MONITOR_LINE, "9 of 9 channels healthy"), wait=0.5
+        )
     assert ground.told == []
 
 

@@ -20,7 +20,7 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import (
-    GAP,
+    STRETCH_GAP,
     Size,
     detail_words,
     episode_words,
@@ -313,7 +313,7 @@ def test_stretches_are_cut_at_gaps_and_nowhere_else(steps, count):
     for part in np.array_split(stamp, count):
         for block in walk.pieces(Block(part, np.zeros((len(part), 6)))):
             found[-1] += block.stamp.tolist()
-    assert found == [stamp[rows].tolist() for rows in pieces(stamp, GAP)]
+    assert found == [stamp[rows].tolist() for rows in pieces(stamp, STRETCH_GAP)]
     assert [at for part in found for at in part] == stamp.tolist()
 
 

@@ -126,7 +126,7 @@ def _single_threshold(run_length: float, reference: float) -> float:
 
 
 #: A larger sample is scaled down to this as a whole, standard deviations.
-LARGEST = 2.0**18
+LARGEST_SAMPLE = 2.0**18
 #: Lasting errors of bias, scale and timing up to this many standard deviations are no
 #: fault: 0.3 % of sensors have more.
 SYSTEMATIC = 3.0
@@ -257,9 +257,9 @@ def judge(
         size = max(size, abs(verdict.scores[i]))
         spread = max(spread, state.variance[i])
         systematic = max(systematic, state.variance[i] - 1.0 + params.bias[i])
-    factor = min(1.0 / math.sqrt(spread), LARGEST / largest)
-    lasting = min(factor * math.sqrt(systematic), LARGEST)
-    shrink = min(1.0, LARGEST / size)
+    factor = min(1.0 / math.sqrt(spread), LARGEST_SAMPLE / largest)
+    lasting = min(factor * math.sqrt(systematic), LARGEST_SAMPLE)
+    shrink = min(1.0, LARGEST_SAMPLE / size)
     verdict.statistic = 0.0
     verdict.threshold = params.threshold
     for i in range(n):
@@ -268,7 +268,7 @@ def judge(
         less = min(
             params.half_shift
             + SYSTEMATIC * math.sqrt((variance - 1.0 + params.bias[i]) / variance),
-            LARGEST,
+            LARGEST_SAMPLE,
         )
         down = state.sides[i]
         up = state.sides[MAX_CHANNELS + i]

@@ -104,6 +104,7 @@ def _contains(rows: Array, smaller: Array) -> NDArray[np.bool_]:
     return contains
 
 
+#: The sets of tables grow with the fourth power of the number of channels.
 MOST_CHANNELS = 9
 MOST_FAULTS = 2
 MOST_SETS = math.comb(MOST_CHANNELS, MOST_FAULTS)
@@ -111,7 +112,7 @@ MOST_CIRCUITS = math.comb(MOST_CHANNELS, 4)
 """No circuit contains another. No larger family of sets of four channels exists (Sperner)."""
 #: Largest number of circuits through one channel, by the same theorem.
 MOST_LIMITS = math.comb(MOST_CHANNELS - 1, 3)
-ABSENT = MOST_CHANNELS  #: In place of a channel, with weight zero.
+NO_CHANNEL = MOST_CHANNELS  #: In place of a channel, with weight zero.
 #: A check up to this multiple of its bound is not violated: rounding is no fault.
 WITHIN = 1 + ROUNDING
 
@@ -435,7 +436,7 @@ class Guaranteed(Detector):
         params["faults"] = self.max_faults
         params["sets"] = len(largest)
         params["first"] = len(self.sets) - len(largest)
-        params["members"] = ABSENT
+        params["members"] = NO_CHANNEL
         params["members"][: len(largest), : self.max_faults] = largest
 
     def _prepare_intervals(self, checks: Array) -> None:

@@ -52,7 +52,7 @@ from fdi_ros.model.samples import Array
 CONSTRUCTIONS = ("svd", "qr")
 NORMS = ("l2", "l1")
 MOST_IN_SET = MAX_CHANNELS - 3
-MOST_SETS = comb(MAX_CHANNELS, 3)
+MOST_TRIPLES = comb(MAX_CHANNELS, 3)
 
 
 @record
@@ -61,10 +61,10 @@ class OneNorm(SingleFault):
 
     sets: Whole  # number of sets
     # [b, k]: channel k of set b
-    channels: Annotated[NDArray[np.uint8], "u1", (MOST_SETS, MOST_IN_SET)]
+    channels: Annotated[NDArray[np.uint8], "u1", (MOST_TRIPLES, MOST_IN_SET)]
     # [b, k]: error of that channel as a linear form of z
     solutions: Annotated[
-        NDArray[np.float64], "f8", (MOST_SETS, MOST_IN_SET, MAX_CHANNELS)
+        NDArray[np.float64], "f8", (MOST_TRIPLES, MOST_IN_SET, MAX_CHANNELS)
     ]
 
 
@@ -316,7 +316,8 @@ def _innovation(axes: Array, noise_std: Array, before: Index, new: int) -> Array
 
 Four = tuple[float, float, float, float]
 
-CHANNELS = 5
+#: The paper identifies among five sensors.
+PAPER_CHANNELS = 5
 CRITERIA = ("determinant", "condition_number")
 NO_POWER = 1e-200
 """Added to every term, so that a sample of zeros causes no division by zero. A condition
@@ -328,12 +329,14 @@ class Struck(WithForms):
     """Constants for [H z] without row j. Its determinant is the single form of score j."""
 
     # standard deviations of the determinants at rest, rad/s
-    determinants_resting: Annotated[NDArray[np.float64], "f8", (CHANNELS,)]
+    determinants_resting: Annotated[NDArray[np.float64], "f8", (PAPER_CHANNELS,)]
     by_condition: Flag  # the criterion is the condition number
     # U' of H without row j, as forms of z
-    complement: Annotated[NDArray[np.float64], "f8", (CHANNELS, 4, CHANNELS)]
+    complement: Annotated[
+        NDArray[np.float64], "f8", (PAPER_CHANNELS, 4, PAPER_CHANNELS)
+    ]
     # singular values of H without row j
-    singular: Annotated[NDArray[np.float64], "f8", (CHANNELS, 3)]
+    singular: Annotated[NDArray[np.float64], "f8", (PAPER_CHANNELS, 3)]
 
 
 @callback(Struck, NoState, SampleInput, SampleVerdict)
@@ -343,8 +346,8 @@ def judge_determinants(
     """Judge one sample by the largest determinant over its standard deviation."""
     statistic = 0.0
     fill_variances(params, sample, verdict)
-    for j in range(CHANNELS):
-        size = abs(dot(params.forms[0, j], sample.z, CHANNELS))
+    for j in range(PAPER_CHANNELS):
+        size = abs(dot(params.forms[0, j], sample.z, PAPER_CHANNELS))
         # A determinant that is always zero has no standard deviation.
         if size > 0:
             std = std_of(
@@ -373,10 +376,10 @@ def condition_without(params: Struck, j: int, sample: SampleInput) -> float:
     s = params.singular[j, 0]
     t = params.singular[j, 1]
     v = params.singular[j, 2]
-    a = dot(u[0], z, CHANNELS)
-    b = dot(u[1], z, CHANNELS)
-    c = dot(u[2], z, CHANNELS)
-    delta = abs(dot(u[3], z, CHANNELS))
+    a = dot(u[0], z, PAPER_CHANNELS)
+    b = dot(u[1], z, PAPER_CHANNELS)
+    c = dot(u[2], z, PAPER_CHANNELS)
+    delta = abs(dot(u[3], z, PAPER_CHANNELS))
     largest = largest_root(
         (a * a, b * b, c * c, delta * delta), (s * s, t * t, v * v, 0.0)
     )
@@ -466,23 +469,24 @@ class Determinant(SingleFaultDetector):
         params["limit"] = largest_form_threshold(
             forms, geometry, self.noise, self.probability
         )
-        for j in range(CHANNELS):
-            others = np.delete(np.arange(CHANNELS), j)
+        for j in range(PAPER_CHANNELS):
+            others = np.delete(np.arange(PAPER_CHANNELS), j)
             complement, params["singular"][j], _ = np.linalg.svd(geometry.axes[others])
             params["complement"][j][:, others] = complement.T
 
     @classmethod
     def refuses(cls, n: int) -> str:
         """Return why the method cannot run on n channels, or ""."""
-        words = f"determinant has {n} channels, expected {CHANNELS}: struck of one row, only [H z] of five is square"
-        return "" if n == CHANNELS else words
+        words = f"determinant has {n} channels, expected {PAPER_CHANNELS}:"
+        words += " struck of one row, only [H z] of five is square"
+        return "" if n == PAPER_CHANNELS else words
 
 
 def determinant_forms(axes: Array) -> Array:
     """Return forms (5, 5) of z. Row j gives the determinant of [axes z] without row j."""
-    forms = np.zeros((CHANNELS, CHANNELS))
-    for j in range(CHANNELS):
-        others = np.delete(np.arange(CHANNELS), j)
+    forms = np.zeros((PAPER_CHANNELS, PAPER_CHANNELS))
+    for j in range(PAPER_CHANNELS):
+        others = np.delete(np.arange(PAPER_CHANNELS), j)
         for place, k in enumerate(others):
             forms[j, k] = (-1.0) ** (place + 1) * np.linalg.det(
                 axes[np.delete(others, place)]
