@@ -49,9 +49,7 @@ DANGER = "faulty AND IN USE: land"
 ODD_SEEDS = (493, 1170)
 
 
-@pytest.mark.parametrize(
-    "seeds", [range(14), [*range(14, 26), *ODD_SEEDS]]
-)
+@pytest.mark.parametrize("seeds", [range(14), [*range(14, 26), *ODD_SEEDS]])
 def test_the_vehicle_never_loses_its_last_imu_by_our_hand(seeds: Sequence[int]) -> None:
     """By the truth of random flights; `python -m mavlink.flights 20000` for more."""
     done = sum((Flight(seed).fly() for seed in seeds), Counter())
