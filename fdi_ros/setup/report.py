@@ -510,7 +510,7 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
     yield from _not_shown(found, unit)
     if words := copy_words(found.reports):
         yield Finding(Role.WARNING, "copy", words, headline="USABLE, BUT LOOK")
-    for topic, words in unused_topics(found.reports):
+    for topic, words in unused_topics(found.reports, found.unread):
         yield Finding(
             Role.WARNING, "left out", words, (topic,), headline="USABLE, BUT LOOK"
         )

@@ -218,6 +218,8 @@ class SetupResult(LearnedSettings):
     #: of all topics
     reports: Sequence[TopicReport] = ()
     damage: tuple[str, ...] = ()
+    #: gyros that cannot be read as such, and why
+    unread: tuple[tuple[str, str], ...] = ()
     #: the topics of the gyros
     chosen: Sequence[TopicReport] = ()
 
@@ -274,7 +276,7 @@ def set_up(
     the proof, by default a part of this one. `FdiError` if the recording is unreadable
     or has no gyros, or no monitor can be built.
     """
-    reports, damage, _ = inspect(bag)
+    reports, damage, unread = inspect(bag)
     chosen = candidates(reports)
     lacking = needs(reports)
     if not chosen:
@@ -307,7 +309,7 @@ def set_up(
         return before, _with_mounts(part, before, reference)
 
     found = _proved(block, bag, start, end, proof, learn)
-    return replace(found, reports=reports, damage=damage, chosen=chosen)
+    return replace(found, reports=reports, damage=damage, unread=unread, chosen=chosen)
 
 
 def recalibrate(
