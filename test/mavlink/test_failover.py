@@ -1199,6 +1199,7 @@ def test_a_file_that_is_none_of_ours_is_not_believed(tmp_path: Path, text: str) 
     talk = Monitored(tmp_path, Autopilot("ardupilot"))
     assert "others can write it" in talk.vehicle.events[-1]
     talk.run(2.0)
+    assert until(talk, lambda: file.read_text() != text)
     assert kept(talk, tmp_path, ()) == (1, [])
 
 
