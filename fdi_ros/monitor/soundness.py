@@ -150,7 +150,8 @@ class Concern(NamedTuple):
     @property
     def sentence(self) -> str:
         """The concern as a sentence. Names of channels keep their small letters."""
-        return f"{self}.".replace("the fused", "The fused", 1)
+        words = f"{self}."
+        return f"T{words[1:]}" if words.startswith("the ") else words
 
 
 PASSES = 20
