@@ -44,18 +44,16 @@ READ_EVERY = 100 * MS  #: Time between two readings of the parameters in flight,
 READ_ON_GROUND = NS // 2  #: The same on the ground, ns.
 READ_HURRIED = 50 * MS  #: The same while an order may depend on the parameters, ns.
 USE_KNOWN_FOR = 10 * NS  #: An older report of a parameter is not known any more, ns.
-REPORTED_WITHIN = (
-    5 * NS
-)  #: A monitor without diagnostics for this time is in doubt, ns.
+#: A monitor without diagnostics for this time is in doubt, ns.
+REPORTED_WITHIN = 5 * NS
 LARGEST_AGE = 1.0  #: Age of the newest judged sample from which the monitor is late, s.
 LARGEST_LOSS = 0.1  #: Largest share of lost messages at which failover is ready.
 READY_TRIP = 300 * MS  #: Longest round trip at which failover is ready, ns.
 MONITOR_LATE = "the monitor is late"
 SIZING = 200 * MS  #: Longest wait of a text for the size of an error, ns.
 COUNTED = 5 * NS  #: Losses are counted over this time, ns.
-ANNOUNCED_AFTER = (
-    3 * NS
-)  #: Readiness must have changed for this time to be announced, ns.
+#: Readiness must have changed for this time to be announced, ns.
+ANNOUNCED_AFTER = 3 * NS
 BOOT_STEP = 3 * NS  #: A boot time that grows by more is another boot, ns,
 #: if the autopilot's time has gone back, or after this time over a link that is quick, ns.
 BACKLOG = 10 * NS

@@ -38,9 +38,8 @@ LONGEST_BREAK = 200 * MS  #: without a break longer than this, ns.
 #: Least error of the odd one in a set of several IMUs, or suspected, in ``min_size``.
 VOTE = 2.0
 SUSPECT_STANDS = NS  #: An IMU must be suspected, and the odd one, for this time, ns.
-LARGE_DIFFERENCE = (
-    0.3  #: Difference from which any doubt of the monitor names the odd IMU, rad/s.
-)
+#: Difference from which any doubt of the monitor names the odd IMU, rad/s.
+LARGE_DIFFERENCE = 0.3
 #: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
 #: 0.2 s to exclude a spike. An autopilot whose primary gyro reads zero is at 50 deg then.
 CLEAR_DIFFERENCE = 0.5
@@ -64,10 +63,11 @@ TURN_RATE = 0.1
 #: One that was bad agrees only after a turn in which its error, if in proportion to the
 #: rate, would be this multiple of ``min_size``.
 SHOWN = 2.0
+#: Or a turn at this part of the rate at which it was seen to be bad: enough for small rates.
+SAME_TURN = 0.8
 TINY = 1e-3  #: Resolution of the messages, rad/s.
-WILD_OSCILLATION = (
-    1.0  #: An oscillation with this standard deviation is an error, rad/s.
-)
+#: An oscillation with this standard deviation is an error, rad/s.
+WILD_OSCILLATION = 1.0
 SKEW = 20 * MS  #: Two IMUs may measure this far apart in time, ns.
 #: Allowed for in a mean difference, ns: more would hide errors while the vehicle shakes.
 USUAL_SKEW = 5 * MS
@@ -669,8 +669,8 @@ class Evidence:
         # What scatters does not agree from `CALM` on: twice that is shown by a shake.
         shake = self.raw.shake(other)[wrong.axis] / (2.0 * CALM)
         shown = max(abs(turn[wrong.axis]), SHOWN * self._min_size * shake)
-        # Most of the rate at which it was seen is enough, if the error was small.
-        return shown >= min(0.8 * wrong.rate, SHOWN * self._min_size / wrong.share)
+        needed = SHOWN * self._min_size / wrong.share
+        return shown >= min(SAME_TURN * wrong.rate, needed)
 
     def _note_names(self, unit: int, agreed: int | None, now: int) -> None:
         """Note which axes were named before the IMU has agreed for long."""
@@ -797,9 +797,8 @@ class Evidence:
         first, second = (k for k in units if k != unit)
         count = self.raw.fewest
         turning = max(self.raw.rate(first), self.raw.rate(second))
-        limit = (
-            LARGE_DIFFERENCE if self._doubts(unit) else CLEAR_DIFFERENCE
-        ) + SCALE * turning
+        least = LARGE_DIFFERENCE if self._doubts(unit) else CLEAR_DIFFERENCE
+        limit = least + SCALE * turning
         rows = zip(
             self.raw.steady(unit, first, now),
             self.raw.steady(unit, second, now),

@@ -78,9 +78,9 @@ SPACED = NS  #: Least time between two announcements that are not urgent, ns.
 #: Angle by which an EKF lane is lost, rad: what its IMU turned too much or too little. In
 #: ArduCopter's simulation lanes recover from 0.4 rad within 10 s, and never from 3 rad.
 LOST_LANE = 1.5
-#: An IMU off by this part of what the last ones in use are off by goes back beside them.
-LESSER = 4.0
 LANE_RECOVERY = 10.0  #: Time constant with which a lane recovers from less, s.
+#: An IMU goes back beside the last ones in use if these are off by this many times as much.
+LESSER = 4.0
 LONG_AGO = -(10**18)  #: A time before all others, ns.
 
 
