@@ -3,7 +3,7 @@ PYTHON ?=
 ARGS ?=
 # Test processes; each takes a ROS domain of its own. One more than cores: tests of nodes mostly wait.
 WORKERS ?= $(shell expr $$(nproc) + 1)
-# Every so many tests of make coverage: a third of them runs most lines that all run.
+# Only every so many of the tests of make coverage.
 EVERY ?= 1
 # Cases of make fuzz.
 N ?= 2000

@@ -58,8 +58,9 @@ class Inlet:
     received: Whole  # messages
     malformed: Whole  # messages
     error: Whole  # reason why the last malformed message was refused
-    stamp: Whole  # of the last good message, ns, or `NEVER`
-    lag: Whole  # least lag behind the other inputs since `NEVER` was written here, ns
+    stamp: Whole  # of the last good message, ns, or `NO_STAMP`
+    # least lag behind the other inputs since `NO_STAMP` was written here, ns
+    lag: Whole
 
 
 @record

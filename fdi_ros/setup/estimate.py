@@ -364,7 +364,7 @@ class _Pass:
         return np.where(inside[:, None], acceleration, 0.0)
 
     def _join_windows(self) -> None:
-        """Join windows to at most `MOST_STEPS` groups of a constant bias."""
+        """Join windows to at most `MOST_GROUPS` groups of a constant bias."""
         blocks = self.blocks
         each = blocks.group_size
         self.groups = [
