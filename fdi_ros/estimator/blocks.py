@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.core.algebra import dot_in, variance_along
+from fdi_ros.core.algebra import along, dot_in, square, variance_along
 from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity, fill_parity
 from fdi_ros.core.subsets import number_in
 from fdi_ros.estimator.displacement import add_displacement_of_block
@@ -34,6 +34,7 @@ from fdi_ros.estimator.estimator import (
 )
 from fdi_ros.estimator.noise import MOTION, REST
 from fdi_ros.estimator.shared_noise import UNEQUAL
+from fdi_ros.model.samples import Array
 
 TURNING_RATIO = 20.0
 """Ratio of the squared angular acceleration to its noise variance from which the body
@@ -42,6 +43,19 @@ turns. If noise passed for motion, delays of zero would be learned."""
 # channel.
 LEAST_REDUNDANCY = 1e-3
 PEAK = 0.8  # factor per block on the peaks of motion: they fade within half a second
+
+
+@compiled
+def fused_variance(params: Constants, kf: Estimator, variance: Array) -> float:
+    """Largest variance of the fused rate about an axis by independent noise, (rad/s)^2.
+
+    ``variance`` (n,) is the noise of the channels, (rad/s)^2.
+    """
+    largest = 0.0
+    for a in range(3):
+        gain = kf.fused.gain[a]
+        largest = max(largest, variance_along(gain, variance, params.sensors.n))
+    return largest
 
 
 @compiled
@@ -55,35 +69,24 @@ def update_acceleration(params: Constants, kf: Estimator) -> float:
     ahead = kf.times[0] - kf.times[1]
     behind = kf.times[1] - kf.times[2]
     span = kf.ended[1] - kf.ended[2]
-    whole = kf.times[0] - kf.times[2]
     # Weights of the two differences, exact to second order for unequal distances.
-    first = behind / (ahead * whole)
-    last = ahead / (behind * whole)
-    worst = single = apart = 0.0
+    first = behind / (ahead * (kf.times[0] - kf.times[2]))
+    last = ahead / (behind * (kf.times[0] - kf.times[2]))
+    contradiction = 0.0
     for a in range(3):
-        total = alone = 0.0
-        for i in range(params.sensors.n):
-            square = kf.fused.gain[a, i] * kf.fused.gain[a, i]
-            total += square * kf.noise.now.block[i]
-            alone += square * kf.noise.now.sample[i]
-        worst = max(worst, total)
-        single = max(single, alone)
-        kf.acceleration[a] = first * (kf.rates[0, a] - kf.rates[1, a]) + last * (
-            kf.rates[1, a] - kf.rates[2, a]
-        )
-        between = (kf.ends[1, a] - kf.ends[2, a]) / span
-        apart += (between - kf.acceleration[a]) * (between - kf.acceleration[a])
-    single *= 2.0 / (span * span)
-    kf.shaken = 0.0
-    noise = (
-        (first * first + last * last + (last - first) * (last - first))
-        * worst
-        / params.length
-    )
-    if apart <= TURNING_RATIO * single or span > 2.0 * params.length * params.period:
-        return noise
+        later = kf.rates[0, a] - kf.rates[1, a]
+        earlier = kf.rates[1, a] - kf.rates[2, a]
+        kf.acceleration[a] = first * later + last * earlier
+        between_ends = (kf.ends[1, a] - kf.ends[2, a]) / span
+        deviation = between_ends - kf.acceleration[a]
+        contradiction += deviation * deviation
+    weights = first * first + last * last + (last - first) * (last - first)
+    noise = weights * fused_variance(params, kf, kf.noise.now.block) / params.length
+    of_ends = fused_variance(params, kf, kf.noise.now.sample) * (2.0 / (span * span))
+    is_whole = span <= 2.0 * params.length * params.period
     # Vibration faster than a block is not resolved, so its traces must not be learned as a delay.
-    kf.shaken = apart
+    is_shaken = is_whole and contradiction > TURNING_RATIO * of_ends
+    kf.shaken = contradiction if is_shaken else 0.0
     return noise
 
 
@@ -95,44 +98,47 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
     sampling instants of single channels, and scale errors that are not linear in the
     rate.
     """
-    n = params.sensors.n
-    states = kf.states
+    noise = update_acceleration(params, kf)
+    kf.turn_noise = noise
+    # At rest a rate on which no channels agree is a fault, not motion.
+    is_fast = square(kf.acceleration) > TURNING_RATIO * noise + kf.shaken
+    kf.turning = is_fast and kf.noise.regime == MOTION
+    for i in range(params.sensors.n):
+        if kf.noise.regime == REST:
+            kf.angular_acceleration[i] = 0.0
+            kf.extra[i] = 0.0
+        else:
+            update_extra_variance(params, kf, i)
+
+
+@compiled
+def update_extra_variance(params: Constants, kf: Estimator, i: int) -> None:
+    """Update the angular acceleration along channel i in motion, and its extra variance."""
     ahead = kf.times[0] - kf.times[1]
     behind = kf.times[1] - kf.times[2]
-    noise = update_acceleration(params, kf)
-    square = 0.0
+    noise = kf.turn_noise
+    axis = params.sensors.axes[i]
+    turn = along(axis, kf.acceleration)
+    speed = along(axis, kf.rates[1])
+    jerk = newest_turn = 0.0
     for a in range(3):
-        square += kf.acceleration[a] * kf.acceleration[a]
-    # At rest a rate on which no channels agree is a fault, not motion.
-    turning = square > TURNING_RATIO * noise + kf.shaken and kf.noise.regime == MOTION
-    kf.turning = turning
-    kf.turn_noise = noise
-    if kf.noise.regime == REST:
-        for i in range(n):
-            kf.angular_acceleration[i] = kf.extra[i] = 0.0
+        after = (kf.rates[0, a] - kf.rates[1, a]) / ahead
+        before = (kf.rates[1, a] - kf.rates[2, a]) / behind
+        newest_turn += axis[a] * after
+        jerk += axis[a] * 2.0 * (after - before) / (ahead + behind)
+    kf.angular_acceleration[i] = turn if kf.turning else 0.0
+    largest_turn = max(abs(turn), abs(newest_turn))
+    surely_turns = max(largest_turn - 2.0 * math.sqrt(noise), 0.0)
+    timing_error = params.timing[i] * surely_turns
+    nonlinear_error = params.nonlinearity[i] * speed
+    kf.extra[i] = timing_error * timing_error + nonlinear_error * nonlinear_error
+    place = params.layout.delays[params.unit[i]]
+    if place < 0:
         return
-    for i in range(n):
-        along = jerk = lately = speed = 0.0
-        for a in range(3):
-            h = params.sensors.axes[i, a]
-            along += h * kf.acceleration[a]
-            speed += h * kf.rates[1, a]
-            after = (kf.rates[0, a] - kf.rates[1, a]) / ahead
-            before = (kf.rates[1, a] - kf.rates[2, a]) / behind
-            lately += h * after
-            jerk += h * 2.0 * (after - before) / (ahead + behind)
-        kf.angular_acceleration[i] = along if turning else 0.0
-        timing_error = params.timing[i] * max(
-            max(abs(along), abs(lately)) - 2.0 * math.sqrt(noise), 0.0
-        )
-        nonlinear_error = params.nonlinearity[i] * speed
-        kf.extra[i] = timing_error * timing_error + nonlinear_error * nonlinear_error
-        place = params.layout.delays[params.unit[i]]
-        if place >= 0:
-            second = states.p[place, place] + states.x[place] * states.x[place]
-            kf.extra[i] += second * (noise + kf.shaken) + (
-                (0.5 * second * jerk) ** 2 if turning else 0.0
-            )
+    states = kf.states
+    delay_square = states.p[place, place] + states.x[place] * states.x[place]
+    second_order = 0.5 * delay_square * jerk if kf.turning else 0.0
+    kf.extra[i] += delay_square * (noise + kf.shaken) + second_order * second_order
 
 
 @compiled
@@ -206,78 +212,113 @@ def update_incoherent(params: Constants, kf: Estimator) -> None:
 
 
 @compiled
-def unlearnable(error: float, inside: float, square: float) -> float:
+def unlearnable(error: float, inside: float, signal_square: float) -> float:
     """Return the variance of a scale error that no number of samples removes.
 
-    ``error`` is the error variance of a channel, ``square`` the mean square of the
-    signal, and ``inside`` the part of ``square`` that may be vibration. Units see
+    ``error`` is the error variance of a channel, ``signal_square`` the mean square of the
+    signal, and ``inside`` the part of it that may be vibration. Units see
     vibration differently, so vibration looks like a scale error of the signal.
     """
-    return error / max(square, 1e-12) * min(1.0, inside / max(square, 1e-12))
+    signal_square = max(signal_square, 1e-12)
+    return error / signal_square * min(1.0, inside / signal_square)
+
+
+@compiled
+def mean_variance(params: Constants, kf: Estimator, i: int, unknown: float) -> float:
+    """Noise variance of a block's mean of channel i, (rad/s)^2.
+
+    ``unknown`` is the factor for slow noise that was not measured yet; 1 leaves it out.
+    """
+    noise = kf.noise
+    return noise.now.block[i] * noise.longest[i] * unknown / params.length
+
+
+@compiled
+def hidden_vibration(
+    params: Constants, kf: Estimator, i: int, a: int, unknown: float
+) -> float:
+    """Mean square of the vibration about axis a that may hide in the noise of channel i, (rad/s)^2."""
+    noise = kf.noise
+    axis = params.sensors.axes[i, a]
+    share = axis * axis / (UNEQUAL * UNEQUAL * params.length)
+    return share * noise.now.block[i] * noise.longest[i] * unknown
+
+
+@compiled
+def largest_vibration(params: Constants, kf: Estimator) -> float:
+    """Largest mean square of a vibration that the units may see differently, (rad/s)^2."""
+    largest = 0.0
+    for a in range(3):
+        largest = max(largest, kf.shared.vibration[a])
+        for i in range(params.sensors.n):
+            largest = max(largest, hidden_vibration(params, kf, i, a, 1.0))
+    for i in range(params.sensors.n):
+        largest = max(largest, kf.incoherent[i] / (UNEQUAL * UNEQUAL))
+    return largest
+
+
+@compiled
+def keep_rate_variances(params: Constants, kf: Estimator, a: int) -> None:
+    """Set the least variance of the states by the rate about axis a."""
+    n = params.sensors.n
+    inside = kf.shared.vibration[a]
+    for i in range(n):
+        unknown = kf.noise.unknown[i]
+        inside = max(inside, hidden_vibration(params, kf, i, a, unknown))
+    # A vibration peak is not motion.
+    rate_square = kf.signal_rate[a] * kf.signal_rate[a]
+    kf.usual_rate[a] += (rate_square - kf.usual_rate[a]) / REST_BLOCKS
+    for i in range(n):
+        error = mean_variance(params, kf, i, kf.noise.unknown[i])
+        least = unlearnable(error, inside, kf.usual_rate[a])
+        keep_least_variance(params.layout, i, RATE_X + a, least, kf.least_variance)
+
+
+@compiled
+def keep_speed_variance(params: Constants, kf: Estimator, i: int) -> None:
+    """Set the least variance of the state by the rate along channel i."""
+    speed_square = inside = 0.0
+    for a in range(3):
+        share = params.sensors.axes[i, a] * params.sensors.axes[i, a]
+        speed_square += share * kf.usual_rate[a]
+        inside += share * kf.shared.vibration[a]
+    error = mean_variance(params, kf, i, kf.noise.unknown[i])
+    inside = max(inside, error / (UNEQUAL * UNEQUAL))
+    least = unlearnable(error, inside, speed_square)
+    keep_least_variance(params.layout, i, SPEED, least, kf.least_variance)
+
+
+@compiled
+def keep_delay_variance(
+    params: Constants, kf: Estimator, i: int, vibration: float
+) -> None:
+    """Set the least variance of the delay of channel i.
+
+    ``vibration`` is the mean square of the vibration that may pass for an angular
+    acceleration, (rad/s)^2. The noise counts with the square root of the unknown slow
+    noise: with the full factor no delay is learned in the first seconds of motion.
+    """
+    error = mean_variance(params, kf, i, math.sqrt(kf.noise.unknown[i]))
+    error = max(error, kf.incoherent[i])
+    turn = kf.angular_acceleration[i]
+    inside = 0.5 * vibration / (kf.span * kf.span)
+    least = unlearnable(error, inside, turn * turn)
+    keep_least_variance(params.layout, i, TURN, least, kf.least_variance)
 
 
 @compiled
 def update_least_variances(params: Constants, kf: Estimator) -> None:
     """Find the variance that each state of the motion keeps at least; biases keep none."""
-    layout = params.layout
-    noise = kf.noise
-    n = params.sensors.n
-    for r in range(layout.count):
+    for r in range(params.layout.count):
         kf.least_variance[r] = 0.0
     if kf.rest:
         return
-    largest_vibration = 0.0
     for a in range(3):
-        inside = kf.shared.vibration[a]
-        largest_vibration = max(largest_vibration, inside)
-        for i in range(n):
-            along = (
-                params.sensors.axes[i, a]
-                * params.sensors.axes[i, a]
-                / (UNEQUAL * UNEQUAL * params.length)
-            )
-            inside = max(
-                inside, along * noise.now.block[i] * noise.longest[i] * noise.unknown[i]
-            )
-            largest_vibration = max(
-                largest_vibration, along * noise.now.block[i] * noise.longest[i]
-            )
-        # A vibration peak is not motion.
-        kf.usual_rate[a] += (
-            kf.signal_rate[a] * kf.signal_rate[a] - kf.usual_rate[a]
-        ) / REST_BLOCKS
-        for i in range(n):
-            error = (
-                noise.now.block[i] * noise.longest[i] * noise.unknown[i] / params.length
-            )
-            least = unlearnable(error, inside, kf.usual_rate[a])
-            keep_least_variance(layout, i, RATE_X + a, least, kf.least_variance)
-    for i in range(n):
-        along = inside = 0.0
-        for a in range(3):
-            share = params.sensors.axes[i, a] * params.sensors.axes[i, a]
-            along += share * kf.usual_rate[a]
-            inside += share * kf.shared.vibration[a]
-        error = noise.now.block[i] * noise.longest[i] * noise.unknown[i] / params.length
-        inside = max(inside, error / (UNEQUAL * UNEQUAL))
-        least = unlearnable(error, inside, along)
-        keep_least_variance(layout, i, SPEED, least, kf.least_variance)
-        # Noise variance of a block as above, but with the square root of the unknown
-        # slow noise: with the full factor no delay is learned in the first seconds of
-        # motion.
-        error = (
-            noise.now.block[i]
-            * noise.longest[i]
-            * math.sqrt(noise.unknown[i])
-            / params.length
-        )
-        error = max(error, kf.incoherent[i])
-        largest_vibration = max(
-            largest_vibration, kf.incoherent[i] / (UNEQUAL * UNEQUAL)
-        )
-        turn = kf.angular_acceleration[i] * kf.angular_acceleration[i]
-        least = unlearnable(error, 0.5 * largest_vibration / (kf.span * kf.span), turn)
-        keep_least_variance(layout, i, TURN, least, kf.least_variance)
+        keep_rate_variances(params, kf, a)
+    vibration = largest_vibration(params, kf)
+    for i in range(params.sensors.n):
+        keep_speed_variance(params, kf, i)
+        keep_delay_variance(params, kf, i, vibration)
 
 
 @compiled
@@ -320,35 +361,41 @@ def learn(params: Constants, kf: Estimator, weight: float) -> None:
 
 
 @compiled
+def update_peaks(
+    params: Constants, kf: Estimator, i: int, moves: bool, turns: bool
+) -> None:
+    """Update the peaks of channel i, which fade: angular acceleration and extra variances."""
+    ahead = kf.times[0] - kf.times[1]
+    axis = params.sensors.axes[i]
+    turn = 0.0
+    if turns:
+        for a in range(3):
+            turn += axis[a] * (kf.rates[0, a] - kf.rates[1, a]) / ahead
+    if abs(kf.angular_acceleration[i]) > abs(turn):
+        turn = kf.angular_acceleration[i]
+    faded = PEAK * kf.peak_turn[i]
+    kf.peak_turn[i] = turn if abs(turn) > abs(faded) else faded
+    kf.peak_extra[i] = max(PEAK * kf.peak_extra[i], kf.extra[i])
+    speed = along(axis, kf.rates[0])
+    nonlinear_error = params.nonlinearity[i] * speed if moves else 0.0
+    faded = PEAK * kf.nonlinear_variance[i]
+    kf.nonlinear_variance[i] = max(faded, nonlinear_error * nonlinear_error)
+
+
+@compiled
 def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
     """Predict the covariance of the next samples from the state uncertainty in the present motion."""
     n = params.sensors.n
     layout = params.layout
-    square = 0.0
     ahead = kf.times[0] - kf.times[1]
+    newest = 0.0
     for a in range(3):
         change = (kf.rates[0, a] - kf.rates[1, a]) / ahead
-        square += change * change
+        newest += change * change
     moves = kf.noise.regime == MOTION
-    begins = kf.turning or (moves and square > 4.0 * TURNING_RATIO * kf.turn_noise)
+    turn_begins = moves and newest > 4.0 * TURNING_RATIO * kf.turn_noise
     for i in range(n):
-        turn = speed = 0.0
-        for a in range(3):
-            h = params.sensors.axes[i, a]
-            turn += h * (kf.rates[0, a] - kf.rates[1, a]) / ahead
-            speed += h * kf.rates[0, a]
-        if not begins:
-            turn = 0.0
-        if abs(kf.angular_acceleration[i]) > abs(turn):
-            turn = kf.angular_acceleration[i]
-        kf.peak_turn[i] = (
-            turn if abs(turn) > PEAK * abs(kf.peak_turn[i]) else PEAK * kf.peak_turn[i]
-        )
-        kf.peak_extra[i] = max(PEAK * kf.peak_extra[i], kf.extra[i])
-        nonlinear_error = params.nonlinearity[i] * speed if moves else 0.0
-        kf.nonlinear_variance[i] = max(
-            PEAK * kf.nonlinear_variance[i], nonlinear_error * nonlinear_error
-        )
+        update_peaks(params, kf, i, moves, kf.turning or turn_begins)
     for a in range(3):
         kf.signal_rate[a] = kf.rates[0, a] if moves else 0.0
     fill_signals(layout, kf.signal_rate, kf.peak_turn, kf.at.signals)
@@ -359,7 +406,7 @@ def predict_innovation_covariance(params: Constants, kf: Estimator) -> None:
         lately = kf.peak_extra[i] + kf.displaced[i] + kf.force_variance
         kf.at.covariance[i, i] += lately
     kf.counted_variance = kf.force_variance
-    kf.speed_squared = kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
+    kf.speed_squared = square(kf.rates[0])
     update_weights(params, kf)
 
 

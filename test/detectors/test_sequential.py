@@ -311,6 +311,26 @@ def test_noise_and_vibration_that_units_do_not_share_teach_no_delay(shown):
         assert abs(status.delays[1]) < 3.0 * status.delay_std[1]
 
 
+def test_units_may_be_listed_in_any_order():
+    """The second and the third of three units, the third with vibration of its own."""
+    seconds = np.arange(0.0, 20.0, 1.0 / RATE)
+    rng = np.random.default_rng(8)
+    vibration = own_vibration(seconds, rng)[:, 3:]
+    z = np.hstack([swing(seconds)] * 3) + SIGMA * white(8, len(seconds), 9)
+    z[:, 6:] += (seconds > 5.0)[:, None] * vibration
+    swapped = np.hstack([z[:, :3], z[:, 6:], z[:, 3:6]])
+    pipeline = Pipeline.from_config(parallel(3, detector__name="sequential"))
+    listed = pipeline.process(stamped(seconds, z))
+    first, second, third = pipeline.status().delay_std
+    pipeline.restart()
+    other = pipeline.process(stamped(seconds, swapped))
+    expected = pytest.approx((first, third, second), rel=1e-6)
+    assert pipeline.status().delay_std == expected
+    order = [0, 1, 2, 6, 7, 8, 3, 4, 5]
+    np.testing.assert_array_equal(other.state, listed.state[:, order])
+    np.testing.assert_allclose(other.rate, listed.rate, rtol=0.0, atol=1e-9)
+
+
 @pytest.mark.parametrize("late", [0.0, 0.005, 0.02])
 def test_a_delay_is_learned_in_slow_motion(late):
     """At 0.3 rad/s, with periods of 5 s and more, well within a minute."""
