@@ -302,7 +302,10 @@ def recording_findings(
         names, noise, [group.tolist() for group in groups], unit.name, unit.factor
     ):
         yield Finding(
-            Role.WARNING, "noise", f"{noisy}; {words}", headline="READY, BUT LOOK"
+            Role.WARNING,
+            "noise",
+            f"{noisy} from sample to sample; {words}",
+            headline="READY, BUT LOOK",
         )
     yield Finding(Role.WORTH, "ready", words, headline="READY")
     yield from topic_findings(chosen, unit)

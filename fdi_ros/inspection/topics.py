@@ -434,7 +434,7 @@ def topics_text(
         units += (
             f"; noise: standard deviation of one sample of each channel, {unit.name};"
         )
-        units += " vibration is included, slow motion is not"
+        units += " motion and slow shaking are not included"
     return (
         indented(table(*told(topic_columns(reports, unit)), figures=False))
         + f"{units}\n"

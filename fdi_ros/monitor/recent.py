@@ -108,6 +108,7 @@ class RecentHealth:
                 continue
             # A stream that has stalled is reported as a whole.
             delivered = (samples[i] - non_finite[i]) / total[i] if total[i] else 1.0
+            noisy = self._was_noisy(status, one)
             yield ChannelHealth(
                 name=one.name,
                 unit=unit_of.get(one.name, ""),
@@ -115,10 +116,11 @@ class RecentHealth:
                 delivered=float(delivered) if measured else 1.0,
                 spikes=int(spikes[i]),
                 saturated_s=float(at_end[i]) / status.config.sample_rate,
-                noisy_s=one.last_noisy.seconds if self._was_noisy(status, one) else 0.0,
+                noisy_s=one.last_noisy.seconds if noisy else 0.0,
                 noisy_from_s=(one.last_noisy.since - status.stamp) / SECOND,
                 noisy_times=one.last_noisy.times,
-                own_noise_rad_s=noise[i],
+                # A short time of noise would count as the noise of the whole minute.
+                own_noise_rad_s=None if noisy else noise[i],
                 measured_in=one.unit,
             )
 
@@ -142,15 +144,14 @@ class RecentHealth:
         """
         residuals = np.array([one.residual for one in self._readings])
         enough = np.isfinite(residuals).sum(axis=0) >= LEAST_RESIDUALS
-        if any(map(is_declared_or_silent, status.channels)) or not enough.any():
-            return [None] * len(status.channels)
-        square = np.nansum(residuals**2, axis=0) / np.isfinite(residuals).sum(axis=0)
         noise: list[float | None] = [None] * len(status.channels)
+        if any(map(is_declared_or_silent, status.channels)) or not enough.any():
+            return noise
         for quantity in dict.fromkeys(one.unit for one in status.channels):
             half = [i for i, one in enumerate(status.channels) if one.unit == quantity]
-            rms = np.sqrt(np.where(enough, square, np.nan)[half])
             axes = np.array([status.channels[i].axis for i in half])
-            for i, value in zip(half, own_noise(rms, axes).tolist(), strict=True):
+            own = own_noise(np.where(enough, residuals, np.nan)[:, half], axes)
+            for i, value in zip(half, own.tolist(), strict=True):
                 noise[i] = value if math.isfinite(value) else None
         return noise
 

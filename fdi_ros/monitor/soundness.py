@@ -10,7 +10,7 @@ a whole flight, the live monitor its last seconds, by the same records.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
@@ -38,6 +38,9 @@ LEAST_RESIDUAL = 1e-9
 """Smallest residual that counts as measured, rad/s, as the smallest ``noise.noise_std``."""
 LEAST_VISIBLE_SHARE = 1e-3
 """Smallest share of the errors of a channel that is taken to show in its residual."""
+LEAST_OF_VISIBLE = 0.25
+"""Smallest visible share of the errors of a channel, over the share with equal noise.
+So a noise below a third of that of all parallel channels counts as a third."""
 LEAST_SPIKES = 3
 """Single wrong samples from which on a channel has spikes. Fewer may be chance."""
 
@@ -72,7 +75,7 @@ class ChannelHealth:
     saturated_s: float = 0.0
     """Time at the end of its range, s."""
     own_noise_rad_s: float | None = None
-    """Standard deviation of its own errors while it was OK, by `own_noise`, rad/s.
+    """Usual standard deviation of its own errors while it was OK, by `own_noise`, rad/s.
     None: never OK, or not measured."""
     noisy_s: float = 0.0
     """Duration of its longest spell of noise, s."""
@@ -140,7 +143,7 @@ class Concern(NamedTuple):
     joined_by: str = "and"
     """``or``: about one of the names, and which one is not known."""
     is_noise: bool = False
-    """Whether it is about noise for a time."""
+    """Whether it is about noise."""
     is_delivery: bool = False
     """Whether it is about messages that a unit did not deliver."""
 
@@ -158,33 +161,51 @@ PASSES = 20
 """Iterations of `own_noise`. It converges by more than a factor of two in each."""
 
 
-def own_noise(residual_rms: Array, axes: Array) -> Array:
+def own_noise(residual: Array, axes: Array) -> Array:
     """Return the standard deviation of the errors of each channel, (n,), rad/s.
 
-    The fused rate follows a quiet channel closely, so the residual of such a channel is
-    smaller than its errors. Of two parallel channels, the residuals show the weights
-    alone. The result is consistent with a fused rate that weights each channel by its
-    inverse variance.
+    The result is consistent with a rate that weights each channel by its inverse variance.
+    It does not depend on the weights of the given rate. Of two parallel channels only the
+    difference is known, so they get the same noise.
 
     Parameters
     ----------
-    residual_rms
-        Root mean square of the difference from the fused rate, (n,), rad/s. NaN:
-        not measured, the channel is ignored.
+    residual
+        Differences from any one rate, (k, n), rad/s. NaN: not usable. A channel that is
+        usable in less than half of the samples is ignored.
     axes
         Sensitivity axes, (n, 3).
     """
-    square = np.where(residual_rms > LEAST_RESIDUAL, residual_rms, np.nan) ** 2
-    known = np.isfinite(square)
-    variance = square.copy()
+    usable = np.isfinite(residual)
+    known = usable.mean(axis=0) >= 0.5
+    rows = residual[usable[:, known].all(axis=1)][:, known]
+    noise: Array = np.full(len(axes), np.nan)
+    if len(rows) < 2 or not known.any():
+        return noise
+    covariance = np.atleast_2d(np.cov(rows, rowvar=False))
+    own = axes[known]
+    variance = np.ones(len(own))
+    visible = np.maximum(np.diag(_left_by_fit(own, variance)), LEAST_VISIBLE_SHARE)
+    least = LEAST_OF_VISIBLE * visible
     for _ in range(PASSES):
-        weight = np.where(known, 1.0 / variance, 0.0)
-        inverse = np.linalg.pinv(axes.T @ (weight[:, None] * axes), hermitian=True)
-        leverage = weight * np.einsum("ij,jk,ik->i", axes, inverse, axes)
-        share = np.maximum(1.0 - leverage, LEAST_VISIBLE_SHARE)
-        variance = np.sqrt(variance * square / share)
-    result: Array = np.sqrt(variance)
-    return result
+        left = _left_by_fit(own, variance)
+        square = np.einsum("ij,jk,ik->i", left, covariance, left)
+        share = np.maximum(np.diag(left), LEAST_VISIBLE_SHARE)
+        variance = np.maximum(np.sqrt(variance * square / share), LEAST_RESIDUAL**2)
+        # Where others err alike, one channel would take all the weight and seem free of noise.
+        share = np.maximum(np.diag(_left_by_fit(own, variance)), LEAST_VISIBLE_SHARE)
+        variance *= np.maximum(least / (1.0 - least) * (1.0 - share) / share, 1.0)
+    noise[known] = np.sqrt(variance)
+    noise[noise <= 2.0 * LEAST_RESIDUAL] = np.nan
+    return noise
+
+
+def _left_by_fit(axes: Array, variance: Array) -> Array:
+    """Return the matrix (n, n) from values to their residuals with weights 1 / variance."""
+    weighted = axes / variance[:, None]
+    fit = np.linalg.pinv(axes.T @ weighted, hermitian=True) @ weighted.T
+    left: Array = np.eye(len(axes)) - axes @ fit
+    return left
 
 
 def concerns_of(
@@ -207,7 +228,6 @@ def concerns_of(
     slow = [unit for unit in units if _is_slow(unit)]
     by_unit = {unit.name for unit in slow}
     alone = [one for one in channels if one.unit not in by_unit]
-    noisier = _noisier(channels)
     return [
         *_alike(
             [one for one in channels if one.checked < LEAST_CHECKED],
@@ -254,12 +274,7 @@ def concerns_of(
             for one in channels
             if one.spikes >= LEAST_SPIKES
         ),
-        *_noisy_for_a_time([one for one in channels if _is_noisy(one)], noisier),
-        *(
-            Concern(Word.LOOK, (one.name,), f"is {noisier[one.name]}")
-            for one in channels
-            if one.name in noisier and not _is_noisy(one)
-        ),
+        *_noise_concerns(channels),
     ]
 
 
@@ -341,16 +356,46 @@ def _doubts(some: Sequence[ChannelHealth]) -> list[Concern]:
     ]
 
 
-def _is_noisy(one: ChannelHealth) -> bool:
-    return one.noisy_s >= LEAST_NOISY_S
+def _noise_concerns(channels: Sequence[ChannelHealth]) -> list[Concern]:
+    """Return concerns about noise: one for each unit, then one for each time of noise.
+
+    Noise that lasts becomes usual, so it is compared with the other units instead.
+    """
+    ratios = _noise_ratios(channels)
+    by_unit: dict[str, list[ChannelHealth]] = {}
+    for one in channels:
+        if one.name in ratios:
+            by_unit.setdefault(one.unit or one.name, []).append(one)
+    lasting = [
+        Concern(
+            Word.LOOK,
+            tuple(one.name for one in own),
+            _lasting_noise_words(own, max(ratios[one.name] for one in own)),
+            is_noise=True,
+        )
+        for own in by_unit.values()
+    ]
+    brief = [
+        one
+        for one in channels
+        if one.noisy_s >= LEAST_NOISY_S and (one.unit or one.name) not in by_unit
+    ]
+    return [*lasting, *_noisy_for_a_time(brief)]
 
 
-def _noisy_for_a_time(
-    channels: Sequence[ChannelHealth], noisier: Mapping[str, str]
-) -> list[Concern]:
+def _lasting_noise_words(own: Sequence[ChannelHealth], ratio: float) -> str:
+    """Describe the noise of channels of a unit, as it continues their names."""
+    most = "up to " if len(own) > 1 else ""
+    words = f"had {most}{figures(ratio, 2)} times the noise of the other units"
+    began = [one.noisy_from_s for one in own if one.noisy_s >= LEAST_NOISY_S]
+    if not began:
+        return words
+    since = f"from {min(began):.1f} s on"
+    return f"{words}, {since if min(began) >= 0.0 else f'for {-min(began):.0f} s'}"
+
+
+def _noisy_for_a_time(channels: Sequence[ChannelHealth]) -> list[Concern]:
     """Return concerns about channels that were noisy for a time, one for each time.
-
-    The usual noise follows what lasts, so words on the noise over all follow.
 
     Channels of several units that are noisy at once measure the same axis: only their
     difference is known, and one of them is noisy.
@@ -363,13 +408,9 @@ def _noisy_for_a_time(
         left = [one for one in left if one not in same]
         began = first.noisy_from_s
         when = f"from {began:.1f} s" if began >= 0.0 else f"{-began:.0f} s ago"
-        words = (
-            f"had noise {figures(max(one.noisy_times for one in same), 2)} times as large as usual"
-            f" for {first.noisy_s:.1f} s, {when}"
-        )
+        times = figures(max(one.noisy_times for one in same), 2)
+        words = f"had noise {times} times as large as usual for {first.noisy_s:.1f} s, {when}"
         names = tuple(one.name for one in channels if one in same)
-        if len(names) == 1 and names[0] in noisier:
-            words += f"; over all it is {noisier[names[0]]}"
         several = len({one.unit for one in same}) > 1
         joined_by = "or" if several else "and"
         found.append(Concern(Word.LOOK, names, words, joined_by, is_noise=True))
@@ -384,9 +425,12 @@ def _are_noisy_together(one: ChannelHealth, other: ChannelHealth) -> bool:
     )
 
 
-def _noisier(channels: Sequence[ChannelHealth]) -> dict[str, str]:
-    """Describe each channel that is much noisier than all other units, by name."""
-    found = {}
+def _noise_ratios(channels: Sequence[ChannelHealth]) -> dict[str, float]:
+    """Return the noise of channels that are much noisier than all other units.
+
+    By name, over the largest noise in the other units.
+    """
+    ratios = {}
     for quantity in dict.fromkeys(one.measured_in for one in channels):
         half = [one for one in channels if one.measured_in == quantity]
         noise = np.array(
@@ -399,6 +443,5 @@ def _noisier(channels: Sequence[ChannelHealth]) -> dict[str, str]:
         for i, one in enumerate(half):
             units.setdefault(one.unit or one.name, []).append(i)
         for i, beside in much_noisier(noise, list(units.values())):
-            times = f"{noise[i] / beside:.0f} times as noisy as the other units"
-            found[half[i].name] = times
-    return found
+            ratios[half[i].name] = float(noise[i]) / beside
+    return ratios

@@ -3,7 +3,7 @@
 
 """Health of channels and units in a recording: messages, finite values, saturation.
 
-All figures are measured on the recorded values, independent of the monitor.
+All figures but the noise are measured on the recorded values, independent of the monitor.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.raw import Batch
+from fdi_ros.core.states import ChannelState
 from fdi_ros.model.quantity import RATE, Quantity
 from fdi_ros.model.samples import Array, Block, Int
-from fdi_ros.monitor.soundness import UnitHealth
+from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.soundness import UnitHealth, own_noise
 
 MOST_WINDOWS = 4096
 """Windows in which messages are counted. For longer recordings their length doubles."""
@@ -37,6 +39,10 @@ LEAST_RAIL = 4.0
 """Smallest end of a range, rad/s. Gyros of 250 deg/s end at 4.36 rad/s."""
 LEAST_FORCE_RAIL = 19.0
 """Smallest end of a range, m/s^2. Accelerometers of 2 g end at 19.6 m/s^2."""
+NOISE_WINDOW = 3.0
+"""Duration of a window in which noise is measured, s: some swings of a loose mount."""
+LEAST_WINDOWS = 3
+"""Smallest number of windows for a noise: fewer are dominated by the start-up."""
 RAIL_RUN = 5
 """Consecutive samples at the largest value that show the end of a range."""
 
@@ -164,6 +170,49 @@ def with_context(unit: UnitHealth, context: FlightContext) -> UnitHealth:
         temperature = float(course.value.min()), float(course.value.max())
     origin = context.origins.get(unit.topic, "")
     return replace(unit, origin=origin, temperature_c=temperature)
+
+
+class UsualNoise:
+    """Measures the noise of channels, block after block: the median of windows.
+
+    So a fault that is shorter than half of the recording does not change it.
+    """
+
+    def __init__(self, axes: Array) -> None:
+        """``axes``: sensitivity axes, (n, 3)."""
+        self._axes = axes
+        self._noise: list[Array] = []
+        """(n,) noise in each window, rad/s."""
+        self._window: list[Array] = []
+        """(k, n) residuals of the present window, rad/s. NaN: the channel was not OK."""
+        self._begin: int | None = None
+        """Stamp of its first sample, ns."""
+
+    def add(self, output: Output) -> None:
+        """Add the next samples."""
+        residual = np.where(output.state == ChannelState.OK, output.residual, np.nan)
+        stamp = output.stamp
+        while len(stamp):
+            if self._begin is None:
+                self._begin = int(stamp[0])
+            inside = stamp < self._begin + NOISE_WINDOW * 1e9
+            count = len(stamp) if inside.all() else int(inside.argmin())
+            self._window.append(residual[:count])
+            residual = residual[count:]
+            stamp = stamp[count:]
+            if len(stamp):
+                self._noise.append(own_noise(np.concatenate(self._window), self._axes))
+                self._window = []
+                self._begin = None
+
+    def result(self) -> Array:
+        """Return the usual noise of each channel, (n,), rad/s. NaN: not measured."""
+        usual: Array = np.full(len(self._axes), np.nan)
+        if self._noise:
+            windows = np.array(self._noise)
+            measured = np.isfinite(windows).sum(axis=0) >= LEAST_WINDOWS
+            usual[measured] = np.nanmedian(windows[:, measured], axis=0)
+        return usual
 
 
 class Values:

@@ -33,10 +33,16 @@ from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.monitor.soundness import RateHealth, UnitHealth, own_noise
+from fdi_ros.monitor.soundness import RateHealth, UnitHealth
 from fdi_ros.monitor.status import ChannelStatus, Status
 from fdi_ros.replay.episodes import STRETCH_GAP, Story, join_halves, pieces
-from fdi_ros.replay.health import Deliveries, Values, with_context, with_delivery
+from fdi_ros.replay.health import (
+    Deliveries,
+    UsualNoise,
+    Values,
+    with_context,
+    with_delivery,
+)
 from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
 from fdi_ros.replay.summary import (
@@ -188,6 +194,7 @@ class Judge(Walk):
         self._values = [
             Values(half.geometry.n, half.quantity) for half in pipeline.halves
         ]
+        self._noise = [UsualNoise(half.geometry.axes) for half in pipeline.halves]
         self._delivered = np.zeros(pipeline.geometry.n, dtype=np.int64)
         """Stamp of the last recorded value of each channel, ns."""
         self._clean: Array | None = None
@@ -233,8 +240,11 @@ class Judge(Walk):
         """Evaluate and record the output for some rows of a piece."""
         self.evaluation.add(output, None if self._clean is None else self._clean[rows])
         time = np.round(self.injector.time(output.stamp), 9)
-        for recorder, half in zip(self._recorders, output.halves, strict=True):
+        for recorder, noise, half in zip(
+            self._recorders, self._noise, output.halves, strict=True
+        ):
             recorder.add(time, half)
+            noise.add(half)
         super().add(block, output, rows)
 
     def judgement(self) -> Judgement:
@@ -313,7 +323,7 @@ class Judge(Walk):
             unit for half in self.pipeline.halves for unit in half.geometry.unit_of
         ]
         residual_rms = evaluation.residual_rms
-        noise = self._own_noise(residual_rms)
+        noise = self._usual_noise()
         for i, status in enumerate(statuses):
             changes = [one for one in evaluation.events if one.channel == status.name]
             before = [one for one in changes if one.at_s <= end]
@@ -352,14 +362,9 @@ class Judge(Walk):
                 unchecked=unchecked,
             )
 
-    def _own_noise(self, residual_rms: Sequence[float | None]) -> list[float | None]:
-        """Return the noise of each channel, rad/s. None: never OK."""
-        left = np.array(residual_rms, dtype=np.float64)
-        found: list[float | None] = []
-        for half in self.pipeline.halves:
-            own, left = np.split(left, [half.geometry.n])
-            found += map(finite, own_noise(own, half.geometry.axes).tolist())
-        return found
+    def _usual_noise(self) -> list[float | None]:
+        """Return the usual noise of each channel, rad/s. None: never OK."""
+        return [finite(noise) for one in self._noise for noise in one.result().tolist()]
 
     def _units(self, status: Status) -> Iterator[UnitHealth]:
         """Yield the health of each unit, or of the one topic with all channels."""

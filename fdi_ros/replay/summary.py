@@ -26,6 +26,9 @@ from fdi_ros.system import require
 if TYPE_CHECKING:
     import pandas
 
+BRIEF = 1.0
+"""A fault that stands for less is reported with its duration, s."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelResult(ChannelHealth):
@@ -197,14 +200,43 @@ class Judgement:
         ]
 
     @property
+    def has_only_brief_sets(self) -> bool:
+        """Whether all that was declared are sets that ended within `BRIEF`.
+
+        Evidence for one channel does not last while its error changes its sign, as noise does.
+        """
+        return all(
+            one.state == "AMBIGUOUS"
+            and not one.stands
+            and one.end_s - one.since_s < BRIEF
+            for one in self.story.declared
+        )
+
+    def _was_faulty(self, channel: ChannelHealth) -> bool:
+        """Whether a channel was named faulty while it was noisy."""
+        end = channel.noisy_from_s + channel.noisy_s
+        return any(
+            one.state == "FAULTY"
+            and channel.name in one.ever
+            and one.start_s < end
+            and one.end_s > channel.noisy_from_s
+            for one in self.story.declared
+        )
+
+    @property
     def concerns(self) -> list[Concern]:
         """Reasons not to call the recording healthy, beside declared faults.
 
-        Noise is compared only while nothing is declared: a fault disturbs the comparison.
+        A fault that lasts disturbs the comparison of noise, and may look like noise itself.
         """
         channels: Sequence[ChannelHealth] = self.monitor.channels
-        if self.story.declared:
-            channels = [replace(one, own_noise_rad_s=None) for one in channels]
+        if self.story.declared and not self.has_only_brief_sets:
+            channels = [
+                replace(one, own_noise_rad_s=None, noisy_s=0.0)
+                if self._was_faulty(one)
+                else replace(one, own_noise_rad_s=None)
+                for one in channels
+            ]
         return concerns_of(channels, self.monitor.units, rate=self.monitor.rate)
 
 

@@ -21,7 +21,7 @@ from fdi_ros.replay.episodes import (
     true_quantity,
     unit_for,
 )
-from fdi_ros.replay.summary import Judgement, ReplayVerdict
+from fdi_ros.replay.summary import BRIEF, Judgement, ReplayVerdict
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.system.text import figures, first_of, listed
 
@@ -29,8 +29,6 @@ LEAST_JUDGED = 0.5
 """Share of the samples that must be judged for a verdict."""
 SILENT_TO_END = 1.0
 """Time to the end for which a channel must be silent or unchecked to be reported, s."""
-BRIEF = 1.0
-"""A fault that stands for less is reported with its duration, s."""
 MOST_CONCERNS = 3
 """Reasons that a verdict lists."""
 
@@ -195,16 +193,11 @@ def _faulty_sentences(
 
 
 def noise_behind(judgement: Judgement) -> list[Concern]:
-    """Return the noise that explains declarations, if these are brief sets alone.
-
-    Evidence for one channel does not last while its error changes its sign.
-    """
+    """Return the noise that explains declarations, if these are brief sets alone."""
     faulty = faulty_episodes(judgement)
-    brief = all(
-        one.state == "AMBIGUOUS" and not one.stands and one.end_s - one.since_s < BRIEF
-        for one in faulty
-    )
-    if not faulty or not brief:
+    if not faulty or not judgement.has_only_brief_sets:
+        return []
+    if not all(one.declares for one in faulty):
         return []
     return [one for one in judgement.concerns if one.is_noise]
 

@@ -519,8 +519,9 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
     if tried.baseline is not None:
         # A replay with these settings would give the same reasons to look.
         for one in tried.baseline.judgement.concerns:
+            words = f"in {found.proof.source}, {one}"
             yield Finding(
-                Role.WARNING, "health", str(one), one.who, headline="USABLE, BUT LOOK"
+                Role.WARNING, "health", words, one.who, headline="USABLE, BUT LOOK"
             )
     limits = [
         line

@@ -455,5 +455,5 @@ def test_settings_from_heavy_vibration_are_for_large_faults_only(root, tmp_path,
     pairs = re.findall(r"(-?[0-9.]+(?:e-?\d+)?) \+- ([0-9.]+(?:e-?\d+)?)", out)
     assert pairs
     assert [pair for pair in pairs if abs(float(pair[0])) < float(pair[1])] == []
-    noisy = "times as noisy as the other units"
+    noisy = "times the noise of the other units"
     assert (noisy in out) >= (noisy in fdi("replay", log, "--config", config).out)
