@@ -26,6 +26,7 @@ from fdi_ros.mavlink.failover_policy import (
     is_apart,
     objection,
 )
+from fdi_ros.mavlink.failover_probe import Probe, probe
 from fdi_ros.mavlink.failover_words import CONDITION_WORDS, imu_name, imu_text
 from fdi_ros.mavlink.protocol import ARDUPILOT, ENOUGH, MS, NS, ImuSample
 from fdi_ros.mavlink.report import INFO, TEXT_LENGTH, WARNING
@@ -114,6 +115,7 @@ class Failover:
         self._booted: int | None = None  # when the autopilot started, ns
         self._restarts = 0  # steps of the autopilot's time found until then
         self._late_since: int | None = None  # messages are late, or after a boot, since
+        self._probe = Probe.begin(count)
         self._read_at = -NS
         self._hurry = False
         self._unsized: dict[int, int] = {}  # IMUs out of use, not announced yet: since
@@ -167,6 +169,7 @@ class Failover:
         decision = decide(self._state, view, now, self._settings)
         self._state = decision.state
         self._hurry = decision.hurry
+        self._try_orders(view, now)
         for imu, use in decision.orders:
             self._vehicle.set_parameter(INS_USE[imu], float(use))
         for imu, condition in decision.words:
@@ -179,6 +182,24 @@ class Failover:
         self._announce_readiness(view, now)
         if error := self._file.keep(self._saved(now), now):
             self._vehicle.events.append(error)
+
+    def _try_orders(self, view: View, now: int) -> None:
+        """Find out whether the autopilot sets INS_USE, while no order depends on it."""
+        is_calm = view.linked and not self._hurry and not self.out
+        denied = self._vehicle.denied
+        memories = self._state.memories
+        self._probe, imu = probe(
+            self._probe,
+            may=[is_calm and bool(use) for use, _ in self._values],
+            heard=[heard for _, heard in self._values],
+            outcomes=[
+                False if memory.obeyed is None and name in denied else memory.obeyed
+                for name, memory in zip(INS_USE, memories, strict=False)
+            ],
+            now=now,
+        )
+        if imu >= 0:
+            self._vehicle.set_parameter(INS_USE[imu], 1.0)
 
     def _saved(self, now: int) -> Saved:
         """Return the content of the file."""
@@ -259,6 +280,8 @@ class Failover:
     def _forget(self) -> None:
         self._values = [(None, 0)] * len(self._values)
         self._lanes = None
+        self._probe = Probe.begin(len(self._values))
+        self._vehicle.denied.clear()
 
     def _read(self, now: int) -> None:
         """Take the reports of parameters, and ask for the next."""
@@ -282,8 +305,9 @@ class Failover:
         pause = READ_HURRIED if self._hurry else usual
         if vehicle.in_reach and now - self._read_at >= pause:
             self._read_at = now
-            for name in names:
-                vehicle.read_parameter(name)
+            for k, name in enumerate(names):
+                if k != self._probe.imu:
+                    vehicle.read_parameter(name)
             if self._lanes is None or not vehicle.armed:
                 vehicle.read_parameter(EKF_LANES)
 
@@ -409,6 +433,11 @@ class Failover:
                 (imu.agreed is None, f"{name} agrees with none"),
                 (not imu.judged, f"{name} is not judged"),
                 (not imu.lane, f"{EKF_LANES} is without {name}"),
+            ]
+        for name, obeys in zip(INS_USE, self._probe.obeys, strict=False):
+            checks += [
+                (obeys is False, f"the autopilot refuses {name}"),
+                (obeys is None, f"setting {name} is not answered"),
             ]
         checks += [
             (self._lanes is None, f"{EKF_LANES} is not reported"),

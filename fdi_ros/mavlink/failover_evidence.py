@@ -55,6 +55,12 @@ SMOOTHNESS = 5.0
 WINDOWS = 4
 #: An oscillation had the other sign, and half the size, within this time, ns.
 TURNED = 300 * MS
+#: Where messages are missing, holes may hide the same half of each period of a vibration.
+#: A difference is one if a frequency of these, Hz, explains it this many times as well as
+#: a straight line does. A vehicle itself swings more slowly.
+FREQUENCIES = np.arange(4.0, 50.0, 0.25)
+BETTER = 4.0
+JUDGED = 12  #: Fewest differences of which this is asked: fewer suit any frequency.
 #: An IMU that the monitor doubts agrees only while the difference scatters by less, rad/s.
 CALM = 0.1
 #: It agrees, and is trusted, only once another one has turned by this on average, rad/s: a
@@ -320,6 +326,7 @@ class RawComparison:
         values = before[-self.fewest :]
         least = np.array(list(map(_steady, values.T.tolist())))
         smooth = np.abs(_mean(values)) >= SMOOTHNESS * _roughness(values)
+        smooth &= ~self._vibrates(rows)
         turned = (2.0 * before * np.sign(least) < -np.abs(least)).any(axis=0)
         x, y, z = np.where(smooth & ~turned, least, 0.0).tolist()
         return x, y, z
@@ -355,6 +362,8 @@ class RawComparison:
         steady = np.abs(_mean(seen)) >= SMOOTHNESS * _roughness(seen)
         if (~steady & (np.abs(mean) >= spread)).any():
             steady |= _lasts(values, np.array(ages) // AVERAGED)
+        if steady.any():
+            steady &= ~self._vibrates(rows)
         x, y, z = (tuple(row.tolist()) for row in (mean, spread, std))
         return Difference(x, y, z, tuple(steady.tolist()))
 
@@ -365,6 +374,36 @@ class RawComparison:
         """
         rows = self._pairs[min(unit, other), max(unit, other)]
         return list(rows) if rows and now - rows[-1][0] <= CURRENT else []
+
+    def _vibrates(self, rows: Sequence[tuple[int, Vector]]) -> np.ndarray:
+        """Return which axes vibrate rather than differ. None do where no message is missing."""
+        times = np.array([at for at, _ in rows])
+        values = np.array([difference for _, difference in rows])
+        if len(rows) < JUDGED or np.diff(times).max() <= self._longest:
+            return np.zeros(3, dtype=bool)
+        age = (times[-1] - times) / NS
+        phase = 2.0 * np.pi * FREQUENCIES[:, None] * age
+        line = _unexplained(np.ones((1, len(age))), age[None], values)
+        wave = _unexplained(np.cos(phase), np.sin(phase), values)
+        vibrates: np.ndarray = line[0] > BETTER * wave.min(axis=0)
+        return vibrates
+
+
+def _unexplained(
+    first: np.ndarray, second: np.ndarray, values: np.ndarray
+) -> np.ndarray:
+    """Return the sum of squares that the best sum of two functions leaves.
+
+    first, second: values of the two, one row each choice. Returned: one row each choice.
+    """
+    ones = np.sum(first * first, axis=1)[:, None]
+    both = np.sum(first * second, axis=1)[:, None]
+    twos = np.sum(second * second, axis=1)[:, None]
+    one = first @ values
+    two = second @ values
+    explained = twos * one**2 - 2.0 * both * one * two + ones * two**2
+    left: np.ndarray = np.sum(values**2, axis=0) - explained / (ones * twos - both**2)
+    return left
 
 
 # As np.mean and np.std, which for so few values cost five times as much.

@@ -3,22 +3,28 @@
 
 """The file with the IMUs that failover left out of use: INS_USE outlives power and companion.
 
-A thread writes, because a slow card may hold fsync for seconds while the link must go on.
-A file that cannot be read or written ends nothing: the vehicle may be in flight.
+A thread writes, because a card may hold fsync for seconds, or for ever, while the link must
+go on. One write is under way at most. A file that cannot be read or written ends nothing:
+the vehicle may be in flight.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from threading import Thread
 from typing import NamedTuple
 
 from fdi_ros.errors import ConfigError
+from fdi_ros.mavlink.protocol import NS
 from fdi_ros.system.files import read_trusted, replacing
 
 LARGEST_FILE = 4096  #: Largest file that is read, bytes.
+RETRY = NS  #: Time between two attempts to write, ns.
+HANGING = 2 * NS  #: A write that takes longer is announced, ns.
+LONGEST_END = 5.0  #: Longest wait for a write at the end, s.
+UNANSWERED = "is not saved: the disk does not answer"
 
 
 class Saved(NamedTuple):
@@ -50,36 +56,58 @@ class FailoverFile:
         self.written = Saved()  #: Content on the disk, as far as known.
         #: Why the file is not read or not written. Empty: it is.
         self.trouble = ""
+        self._error = ""  # of the last write
+        self._writer: Thread | None = None
+        self._begun = 0  # when the last write began, ns. 0: in the constructor
         try:
             self.written = self._read(count)
-            self._write(self.written)
+            # That it can be written shows before the flight.
+            self._begin(self.written)
         except ConfigError as error:
-            self.trouble = str(error)
+            self.trouble = self._error = str(error)
         self._wanted = self.written
-        self._thread = ThreadPoolExecutor(max_workers=1)
-        self._job: Future[None] | None = None
-        self._retry = 0
 
     def keep(self, saved: Saved, now: int) -> str:
         """Write new content in another thread. Return an error that is new, or an empty text."""
         before = self.trouble
         self._wanted = saved
-        if self._job is not None and self._job.done():
-            cause = self._job.exception()
-            self._job = None
-            self.trouble = "" if cause is None else str(cause)
-            if cause is not None:
-                self._retry = now + 1_000_000_000
-        is_due = self.trouble or saved.lasting != self.written.lasting
-        if is_due and self._job is None and now >= self._retry:
-            self._job = self._thread.submit(self._write, saved)
+        self._begun = self._begun or now
+        if not self._is_writing:
+            self.trouble = self._error
+            pause = RETRY if self.trouble else 0
+            if (self.trouble or self._is_behind) and now - self._begun >= pause:
+                self._begun = now
+                self._begin(saved)
+        elif now - self._begun >= HANGING:
+            self.trouble = f"failover_file {self._path} {UNANSWERED}"
         return self.trouble if self.trouble != before else ""
 
     def close(self) -> None:
         """Write the last content, if that has not been done. Raise `ConfigError` if it fails."""
-        self._thread.shutdown()
-        if self._wanted.lasting != self.written.lasting:
-            self._write(self._wanted)
+        self._wait()
+        if self._is_behind and not self._is_writing:
+            self._begin(self._wanted)
+            self._wait()
+        if self._is_behind:
+            hangs = f"failover_file {self._path} {UNANSWERED}"
+            raise ConfigError(hangs if self._is_writing else self._error)
+
+    @property
+    def _is_writing(self) -> bool:
+        return self._writer is not None and self._writer.is_alive()
+
+    @property
+    def _is_behind(self) -> bool:
+        return self._wanted.lasting != self.written.lasting
+
+    def _begin(self, saved: Saved) -> None:
+        """Begin to write in a thread that does not hold up the end of the process."""
+        self._writer = Thread(target=self._write, args=(saved,), daemon=True)
+        self._writer.start()
+
+    def _wait(self) -> None:
+        if self._writer is not None:
+            self._writer.join(LONGEST_END)
 
     def _read(self, count: int) -> Saved:
         try:
@@ -128,7 +156,9 @@ class FailoverFile:
             with replacing(self._path) as file:
                 file.write(json.dumps(content).encode())
         except OSError as error:
-            raise ConfigError(
+            self._error = (
                 f"failover_file {self._path} cannot be written: {error.strerror}"
-            ) from error
-        self.written = saved
+            )
+        else:
+            self._error = ""
+            self.written = saved

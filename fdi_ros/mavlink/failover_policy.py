@@ -170,6 +170,7 @@ class Memory:
     out_sent: int = LONG_AGO  #: When the last order "out of use" was sent.
     back_sent: int = LONG_AGO  #: When the last order "in use" was sent.
     tries: int = 0  #: Copies sent of the present order.
+    obeyed: bool | None = None  #: Whether the last order was. None: not known.
     taken: int = 0  #: Number of times taken out in this flight.
     left_alone: bool = False
     without_notch: bool = False  #: Ours, and out of use at the autopilot's last start.
@@ -300,11 +301,7 @@ def decide(
     memories = tuple(Memory(**vars(memory)) for memory in state.memories)
     for memory, imu in zip(memories, view.imus, strict=True):
         if view.boots != state.boots:
-            # Parameters outlive a boot. The next report shows how it began.
-            memory.seen = memory.against_since = None
-            memory.lane_angle = 0.0
-            memory.tries = 0
-            memory.held = memory.without_notch = memory.ours  # until reported in use
+            _begin_anew(memory)
         _remember(memory, imu, view, now, settings)
     _note_lanes(memories, view, now - state.at, settings)
     _release(memories, view, now, settings)
@@ -313,12 +310,7 @@ def decide(
     for k, memory in enumerate(memories):
         if _is_due(k, memories, view, now, settings):
             orders.append(Order(k, not memory.held))
-            memory.ours = True
-            memory.tries += 1
-            if memory.held:
-                memory.out_sent = now
-            else:
-                memory.back_sent = now
+            _note_order(memory, now)
     announced = dict(state.announced)
     words = []
     # Without a link nobody would read them.
@@ -352,6 +344,15 @@ def decide(
         state=PolicyState(memories, announced, view.boots, now),
         hurry=(view.armed and doubtful) or unsettled,
     )
+
+
+def _begin_anew(memory: Memory) -> None:
+    """Forget what a start of the autopilot ends. Parameters outlive it."""
+    # The next report shows how it began.
+    memory.seen = memory.obeyed = memory.against_since = None
+    memory.lane_angle = 0.0
+    memory.tries = 0
+    memory.held = memory.without_notch = memory.ours  # until reported in use
 
 
 def _remember(
@@ -394,6 +395,8 @@ def _hear(memory: Memory, use: bool, heard: int) -> None:
             return
     memory.against_since = None
     changed = memory.seen is not None and use != memory.seen
+    if changed and memory.ours and use == ordered:
+        memory.obeyed = True
     settled = heard - memory.out_sent >= SETTLED
     if not memory.ours:
         by_others = changed
@@ -503,6 +506,18 @@ def _is_due(
         return is_open and not objection(k, memories, view, now, settings)
     unanswered = not imu.use or imu.heard <= memory.back_sent
     return memory.ours and unanswered
+
+
+def _note_order(memory: Memory, now: int) -> None:
+    """Note that the wanted state of an IMU is ordered now."""
+    memory.ours = True
+    memory.tries += 1
+    if memory.tries > QUICK_TRIES:
+        memory.obeyed = False
+    if memory.held:
+        memory.out_sent = now
+    else:
+        memory.back_sent = now
 
 
 def _conditions(

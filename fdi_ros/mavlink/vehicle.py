@@ -14,6 +14,7 @@ adds PARAM_REQUEST_READ and PARAM_SET.
 
 from __future__ import annotations
 
+import re
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -43,6 +44,7 @@ from fdi_ros.mavlink.protocol import (
 from fdi_ros.system import require
 
 HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
+STATUSTEXT = 253
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
 AUTOPILOT_COMPONENT = 1
 GROUND_STATION, ONBOARD_CONTROLLER = 6, 18  #: MAV_TYPE
@@ -60,6 +62,8 @@ MOST_LATE = 8  #: After this number of late messages in a row the count begins a
 _PEERS = 8  # largest number of addresses with a parser
 # bytes after which a parser's buffer is cut: pymavlink cuts an empty one only
 _LEFT = 1 << 12
+#: ArduPilot's text where it refuses to set a parameter.
+DENIED = re.compile(r"Param write denied \((\w+)\)")
 LARGEST_FLOAT = 3.4e38  #: Largest float in a message.
 
 
@@ -174,6 +178,8 @@ class Vehicle:
         self.gives_gyros = False
         #: Parameters reported: names and values. The reader takes them out.
         self.parameters: deque[tuple[str, float]] = deque(maxlen=64)
+        #: Parameters that the autopilot has refused to set.
+        self.denied: deque[str] = deque(maxlen=64)
         self._found = self._first_imu = 0
         # Kinds and units that sent samples, until a kind is chosen.
         self._seen: set[tuple[str, int]] = set()
@@ -219,15 +225,20 @@ class Vehicle:
             is_new = self._count_lost(sequence)
             if number in IMU_MESSAGES:
                 return self._sample(number, data[header : header + data[1]], now)
-            if number == TIMESYNC:
-                self.sync.answer(message.ts1, message.tc1, now)
-            elif number == PARAM_VALUE and is_new:
-                self.parameters.append(
-                    (message.param_id.partition("\0")[0], message.param_value)
-                )
-            elif number == COMMAND_ACK and message.command == SET_MESSAGE_INTERVAL:
-                self.streams.acknowledged(message.result)
+            self._hear(message, number, is_new, now)
         return None
+
+    def _hear(self, message: Any, number: int, is_new: bool, now: int) -> None:
+        """Take an answer. is_new: it has overtaken no other message."""
+        if number == TIMESYNC:
+            self.sync.answer(message.ts1, message.tc1, now)
+        elif number == PARAM_VALUE and is_new:
+            name = message.param_id.partition("\0")[0]
+            self.parameters.append((name, message.param_value))
+        elif number == STATUSTEXT and (found := DENIED.match(message.text)):
+            self.denied.append(found[1])
+        elif number == COMMAND_ACK and message.command == SET_MESSAGE_INTERVAL:
+            self.streams.acknowledged(message.result)
 
     def _parsed(self, peer: Any, data: bytes) -> list[Any]:
         """Return the messages in bytes; each address has a parser of its own."""

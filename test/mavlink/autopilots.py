@@ -9,8 +9,8 @@ sends the sample that is newest when a stream is due, with the time of that samp
 asks for TIMESYNC itself; HIGHRES_IMU is the IMU it has selected, always under id 0. ArduPilot stamps with the time of
 sending, its gyros are those of the last turn of its loop, RAW_IMU is IMU 1 in mrad/s; intervals are whole milliseconds.
 Both send SCALED_IMU3 with zeros but for the magnetometer where there is a third compass and no third IMU.
-ArduPilot's parameters outlive a restart, come as float, are said to all whenever they are set, and again with their old
-value when that is refused; it flies with the first IMU that is in use.
+ArduPilot's parameters outlive a restart, come as float, are said to all whenever they are set, also to the same value,
+and again with their old value after the text `Param write denied (NAME)`; it flies with the first IMU that is in use.
 Seen in ArduCopter 4.6.3's own simulation: a read is answered up to 100 ms late, from another thread, with the value of
 when it was read (`late_reads`); EKF lane k follows IMU k, or the first IMU in use while IMU k is out (`lanes`); notch
 filters are allocated at the start, only for IMUs in use then (`notches`), and EKF lanes for the IMUs in EK3_IMU_MASK,
@@ -108,7 +108,9 @@ class Autopilot:
     read_only: set[str] = field(default_factory=set)
     sets: list[tuple[int, str, float]] = field(
         default_factory=list
-    )  # when each PARAM_SET came, ns, and what it said
+    )  # when each PARAM_SET came, ns, and what it said, but those of 1 where it is 1
+    probes: list[tuple[int, str]] = field(default_factory=list)  # and when these came
+    hears_sets: bool = True  # a router may drop PARAM_SET, and pass all else
     armed: bool = False
     sent: int = 0
     late_reads: int = 0  # ns by which an answer to a read is late
@@ -283,8 +285,16 @@ class Autopilot:
         ):
             return
         if message.get_type() == "PARAM_SET":
-            self.sets.append((now, name, message.param_value))
-            if name not in self.read_only:
+            if self.parameters[name] == message.param_value == 1.0:
+                self.probes.append((now, name))
+            else:
+                self.sets.append((now, name, message.param_value))
+            if not self.hears_sets:
+                return
+            if name in self.read_only:
+                denial = f"Param write denied ({name})".encode()
+                self._send(self.mav.statustext_encode(4, denial), out)
+            else:
                 self.parameters[name] = message.param_value
             self.say_parameter(name, out)
             return

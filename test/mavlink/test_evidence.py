@@ -416,18 +416,41 @@ def test_a_pause_of_the_messages_makes_no_error_of_a_vibration(
         assert not watched.blamed(0.4)
 
 
-def over_a_lossy_link(share: float) -> Watched:
-    """Return IMUs of whose messages a link loses a share."""
+def over_a_lossy_link(share: float, period: float = 0.0) -> Watched:
+    """Return IMUs of whose messages a link loses a share, at random or each period, s."""
     watched = Watched(interval=NINE, loop=400.0)
     lost = np.random.default_rng(3)
     feed = watched.evidence.raw.feed
 
     def lossy(unit: int, stamp: int, rate: tuple[float, float, float]) -> None:
-        if lost.random() >= share:
+        phase = stamp / NS % period / period if period else lost.random()
+        if phase >= share:
             feed(unit, stamp, rate)
 
     watched.evidence.raw.feed = lossy  # type: ignore[method-assign]
     return watched
+
+
+@pytest.mark.parametrize(
+    ("frequency", "share", "period"),
+    [
+        (10.0, 0.45, 0.1),
+        (9.8, 0.4, 0.1),
+        (20.2, 0.5, 0.05),
+        (5.1, 0.5, 0.2),
+        (5.1, 0.3, 0.2),
+    ],
+)
+def test_holes_that_come_as_often_as_a_vibration_make_no_error_of_it(
+    frequency: float, share: float, period: float
+) -> None:
+    watched = over_a_lossy_link(share, period)
+    watched.gyros[2] = vibrating(watched, 0.3, frequency)
+    watched.run(1.0)
+    watched.states[6] = FAULTY
+    assert not watched.blamed(4.0)
+    watched.gyros[2] = biased(0.3)
+    assert watched.blamed(0.5) == {2}
 
 
 def test_a_difference_stays_known_over_a_link_that_loses_messages() -> None:

@@ -20,6 +20,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink import failover_file
 from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
 from fdi_ros.mavlink.failover_file import FailoverFile
@@ -479,10 +480,11 @@ def test_reports_from_before_an_order_that_come_late_are_no_reports(
     send = flying._travel
     late = 5 * NS // 2
     until = 0
+    before = flying.sent["PARAM_SET"]
 
     def travel(to, data, peer) -> None:
         nonlocal until
-        if flying.sent["PARAM_SET"] and not until:
+        if flying.sent["PARAM_SET"] > before and not until:
             until = flying.now + 4 * NS
             flying._under_way = [
                 (at + late if number < 0 else at, order, number, peer, data)
@@ -1034,6 +1036,34 @@ def test_a_late_or_silent_monitor_and_a_poor_link_are_not_ready(
     assert reason(flying.run(12.0)) == "ready"
 
 
+def test_an_autopilot_that_refuses_orders_is_not_ready(tmp_path: Path) -> None:
+    """It denies them, or a router drops them and passes all else."""
+    autopilot = Autopilot("ardupilot", hears_sets=False, late_reads=80 * MS)
+    talk = Monitored(tmp_path, autopilot).run(12.0)
+    assert reason(talk) == "no failover: setting INS_USE is not answered"
+    autopilot.hears_sets = True
+    assert reason(talk.run(12.0)) == "ready"
+    autopilot.probes.clear()
+    assert not talk.run(20.0).autopilots[0].probes, "once in a conversation"
+    autopilot.read_only.add("INS_USE2")
+    autopilot.reboot(talk.now)
+    assert reason(talk.run(12.0)) == "no failover: the autopilot refuses INS_USE2"
+    assert not autopilot.sets
+    assert talk.in_use == [True] * 3
+
+
+def test_an_order_that_was_refused_is_remembered(flying: Monitored) -> None:
+    autopilot = flying.autopilots[0]
+    autopilot.read_only.add("INS_USE")
+    flying.fault(1, 0.5, seconds=3.0).heal(1, 8.0)
+    assert flying.in_use == [True] * 3
+    assert reason(flying) == "no failover: the autopilot refuses INS_USE"
+    assert flying.texts[-1] == reason(flying)
+    autopilot.read_only.clear()
+    assert flying.fault(1, 0.5, seconds=2.0).in_use == [False, True, True]
+    assert reason(flying.heal(1, 12.0)) == "ready"
+
+
 def test_what_cannot_be_seen_is_not_ready(flying: Monitored, tmp_path: Path) -> None:
     flying.states = [UNCHECKED] * 9
     assert reason(flying.run(1.0)) == "no failover: IMU 1 is not judged"
@@ -1167,6 +1197,33 @@ def test_a_size_is_given_when_it_is_known(flying: Monitored) -> None:
     assert out in ([], ["IMU 1 out of use"])
 
 
+def test_a_disk_that_never_answers_holds_up_neither_start_nor_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    release = threading.Event()
+    writes: list[Path] = []
+
+    def never(path: Path):
+        writes.append(path)
+        release.wait()
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(failover_file, "replacing", never)
+    monkeypatch.setattr(failover_file, "LONGEST_END", 0.01)
+    talk = Monitored(tmp_path, Autopilot("ardupilot")).run(12.0)
+    assert reason(talk) == "no failover: failover_file is not usable"
+    words = "is not saved: the disk does not answer"
+    assert sum(words in event for event in talk.vehicle.events) == 1
+    talk.autopilots[0].armed = True
+    talk.run(1.0).fault(1, 0.5, seconds=1.0)
+    assert talk.in_use == [False, True, True]
+    assert reason(talk).endswith("; failover_file is not written")
+    assert len(writes) == 1
+    with pytest.raises(ConfigError, match=words):
+        talk.failover.close()
+    release.set()
+
+
 def test_a_file_that_cannot_be_written_in_flight_is_announced_and_written_later(
     flying: Monitored, tmp_path: Path
 ) -> None:
@@ -1219,7 +1276,8 @@ def test_a_full_disk_at_a_start_in_flight_ends_nothing(
     boot, start = autopilot.boot, autopilot.start
     again = Monitored(tmp_path, autopilot)
     again.now, autopilot.boot, autopilot.start = flying.now, boot, start
-    assert "No space left on device" in again.vehicle.events[0]
+    full_disk = "No space left on device"
+    assert until(again, lambda: any(full_disk in one for one in again.vehicle.events))
     again.fault(1, 0.3, seconds=8.0)
     assert again.in_use == [False, True, True]
     assert reason(again).startswith("out of use: IMU 1 of system 1")
