@@ -14,6 +14,7 @@ import json
 import os
 import shlex
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
@@ -329,30 +330,27 @@ class Fleet:
         count = _count(len(self.flights), "flight")
         if not self.looks:
             return Verdict(Severity.GOOD, f"HEALTHY: {count}, none needs a look.")
-        faulty = sum(
-            any(why.startswith("FAULTY") for why in row["why"]) for row in self.looks
-        )
-        failed = sum(bool(row["error"]) for row in self.looks)
-        reasons = {
-            "faulty": faulty,
-            "not judged": failed,
-            "to look at": len(self.looks) - faulty - failed,
-        }
-        words = ", ".join(
-            f"{number} {reason}" for reason, number in reasons.items() if number
-        )
-        return Verdict(
-            Severity.BAD if faulty else Severity.UNKNOWN,
-            f"LOOK AT {len(self.looks)} of {count}: {words}.",
-        )
+        counts = Counter(map(_class_of, self.looks))
+        words = ", ".join(f"{counts[word]} {word}" for word in _CLASSES if counts[word])
+        sentence = f"LOOK AT {len(self.looks)} of {count}: {words}."
+        if self.calm:
+            are = "is" if len(self.calm) == 1 else "are"
+            sentence += f" The other {len(self.calm)} {are} HEALTHY."
+        severity = Severity.BAD if counts["FAULTY"] else Severity.UNKNOWN
+        return Verdict(severity, sentence)
 
     def lines(self) -> list[str]:
         """Return the result in sentences, the verdict first."""
         own = self.figures()
-        declaring = sum(row["declared"] > 0 for row in self.judged)
+        declaring = sum(row["episodes"] > 0 for row in self.judged)
+        faults = f"{_count(own['episodes'], 'fault')} declared"
+        if declaring:
+            faults += f", in {_count(declaring, 'flight')}"
+        faulty = sum(_class_of(row) == "FAULTY" for row in self.looks)
+        if silent := faulty - declaring:
+            faults += f"; in {_count(silent, 'flight')} a unit fell silent for good"
         counts = (
-            f"{_count(own['vehicles'], 'vehicle')}; {_count(own['not_judged'], 'flight')} could not be judged;"
-            f" {_count(own['episodes'], 'fault')} declared, in {_count(declaring, 'flight')};"
+            f"{_count(own['vehicles'], 'vehicle')}; {faults};"
             f" {own['watched'] / 3600:.2f} hours judged without a declared fault."
         )
         damaged = f"{_count(own['damaged'], 'recording')} could not be read whole."
@@ -389,6 +387,19 @@ class Fleet:
         ]
         _, *others = self.lines()
         return page("fdi_ros: fleet", [self.verdict, *others], sections)
+
+
+_CLASSES = ("FAULTY", "CANNOT TELL", "LOOK", "not judged")
+"""Classes of flights that need attention, the worst first."""
+
+
+def _class_of(row: Row) -> str:
+    """Return the class of a flight that needs attention: the word of its replay."""
+    if row["error"]:
+        return "not judged"
+    word = row["why"][0].partition(":")[0]
+    # The settings of a healthy flight may still need a look.
+    return word if word in _CLASSES else "LOOK"
 
 
 def columns_of(flights: Sequence[Row]) -> list[Column]:
@@ -437,7 +448,8 @@ def columns_of(flights: Sequence[Row]) -> list[Column]:
             "not checked",
             lambda shares: number(max(shares or (), default=None), ".0%"),
         ),
-        column("declared", "declared", lambda count: number(count, "d")),
+        column("episodes", "faults", lambda count: number(count, "d")),
+        Column("declared", [row["declared"] for row in flights]),
         column(
             "damage",
             "damage",

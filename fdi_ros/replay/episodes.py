@@ -337,9 +337,17 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     figure = f"{'-' if value < 0 else '+'}{figure}" if abs(value) > std else TOO_SMALL
     if size.course == "gone":
         return f"{figure}, until {size.gone_s:.3f} s"
-    if size.course == "growing":
-        return f"{figure}, growing to {figures(size.last_rad_s * unit.factor, 3, '+')} {unit.name}"
-    return figure if size.course == "steady" else f"{figure}, {size.course}"
+    if size.course == "steady":
+        return figure
+    last = figures(size.last_rad_s * unit.factor, 3, "+")
+    return f"{figure}, {course_word(size)} to {last} {unit.name}"
+
+
+def course_word(size: Size) -> str:
+    """Return how a drifting error moves: ``growing``, ``shrinking``, or ``changing`` its sign."""
+    grows = abs(size.last_rad_s) > abs(size.rad_s)
+    keeps = size.rad_s * size.last_rad_s > 0.0 and grows == (size.course == "growing")
+    return size.course if keeps else "changing"
 
 
 def is_factor(share: float) -> bool:
@@ -469,7 +477,11 @@ def detail_words(
         [("injected faults", ", ".join(one.injected) or "nothing")] if scored else []
     )
     lines = [
-        ("lasted", f"{_seconds(one.duration_s)}{', to the end' if one.stands else ''}")
+        (
+            "lasted",
+            f"{_seconds(one.duration_s)}, from {one.start_s:.1f} s"
+            f" to {'the end' if one.stands else f'{one.end_s:.1f} s'}",
+        )
     ]
     if one.declares:
         axes = dict.fromkeys(candidate.axis for candidate in one.candidates)
@@ -480,10 +492,9 @@ def detail_words(
         ]
         if growing and len(one.channels) <= FEW_CHANNELS:
             lines.append(("size", "; ".join(growing)))
-        lines += [
-            ("evidence", _evidence(one)),
-            ("alternative", _rivals(one, unit)),
-        ]
+        lines.append(("evidence", _evidence(one)))
+        if rivals := _rivals(one):
+            lines.append(("alternative", rivals))
     what = "rate" if one.measured_in == RADIANS.name else "specific force"
     return [*lines, (f"fused {what}", _rate(one, unit)), *injected]
 
@@ -497,14 +508,17 @@ def _growth(one: Candidate, unit: Unit) -> str:
         figures(value * unit.factor, 3, "+")
         for value in (size.rad_s, size.last_rad_s, size.slope_rad_s2)
     )
-    return f"{one.channel} {size.course} by {slope} {unit.name} per second, from {first} to {last} {unit.name}"
+    return f"{one.channel} {course_word(size)} by {slope} {unit.name} per second, from {first} to {last} {unit.name}"
 
 
 def _evidence(one: Episode) -> str:
     """Describe the evidence for a declaration."""
     words = [one.evidence.reason] if one.evidence.reason else []
-    if one.evidence.ratio is not None:
-        words.append(f"statistic {one.evidence.ratio:.2f} times its threshold")
+    # Below the threshold the reason is another one, such as values that come and go.
+    if one.evidence.ratio is not None and one.evidence.ratio >= 1.0:
+        words.append(
+            f"statistic {one.evidence.ratio:.2f} times its threshold when declared"
+        )
     if (
         one.state == "AMBIGUOUS"
         and one.evidence.last_alarm_s is not None
@@ -514,8 +528,8 @@ def _evidence(one: Episode) -> str:
     return ", ".join(words)
 
 
-def _rivals(one: Episode, unit: Unit) -> str:
-    """Name other channels that would explain the evidence."""
+def _rivals(one: Episode) -> str:
+    """Name other channels that would explain the evidence. Empty: the first line has them."""
     if one.state == "FAULTY":
         return (
             "no other single channel explains the evidence"
@@ -524,13 +538,7 @@ def _rivals(one: Episode, unit: Unit) -> str:
         )
     if len(one.channels) > FEW_CHANNELS:
         return f"an error of any of {', '.join(one.channels)}"
-    sizes = [
-        (candidate.channel, size_words(candidate.size, unit))
-        for candidate in one.candidates
-    ]
-    return "; or ".join(
-        f"an error of {name}{f', {words}' if words else ''}" for name, words in sizes
-    )
+    return ""
 
 
 def _rate(one: Episode, unit: Unit) -> str:

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from fdi_ros.core.states import Reason
 from fdi_ros.monitor.soundness import Concern, Word, word_of
@@ -17,6 +17,7 @@ from fdi_ros.replay.episodes import (
     MOST_TOLD,
     Episode,
     Size,
+    course_word,
     is_factor,
     true_quantity,
     unit_for,
@@ -130,17 +131,19 @@ def _verdict_on_faults(judgement: Judgement) -> ReplayVerdict:
     isolated = judgement.scores.isolated
     detected = sum(fault.detected_at_s is not None for fault in faults)
     plural = "fault" if len(faults) == 1 else "faults"
-    unexplained = any(not one.injected for one in judgement.story.declared)
+    unexplained = [one for one in judgement.story.declared if not one.injected]
     if wrongly_named(judgement) or unexplained:
         word = "FALSE ALARM"
     else:
         word = "FOUND" if isolated == len(faults) else "NOT ALL FOUND"
     names = dict.fromkeys(name for fault in faults for name in fault.declared_channels)
-    return ReplayVerdict(
-        word,
-        f"{detected} of {len(faults)} injected {plural} detected, {isolated} isolated.",
-        tuple(names),
+    score = (
+        f"{detected} of {len(faults)} injected {plural} detected, {isolated} isolated."
     )
+    if unexplained:
+        first = unexplained[0]
+        score = f"NOT INJECTED: {_who(first)} {_when(first)}. {score}"
+    return ReplayVerdict(word, score, tuple(names))
 
 
 def _healthy_words(judgement: Judgement) -> str:
@@ -189,7 +192,46 @@ def _faulty_sentences(
     if others:
         sentences.append(f"Also {first_of(list(others), MOST_TOLD)}.")
     sentences += [f"{one}." for one in noise_behind(judgement)[:MOST_CONCERNS]]
-    return " ".join(sentences)
+    return " ".join([*sentences, _advice(judgement, faulty)])
+
+
+def _advice(judgement: Judgement, faulty: Sequence[Episode]) -> str:
+    """Return what to do before the next flight about all faults."""
+    unit_of = {one.name: one.unit or one.name for one in judgement.monitor.channels}
+    named: dict[str, None] = {}
+    doubted: list[list[str]] = []
+    for one in faulty:
+        units = list(dict.fromkeys(unit_of.get(name, name) for name in one.channels))
+        if one.state == "AMBIGUOUS" and len(units) > 1:
+            doubted.append(units)
+        else:
+            named |= dict.fromkeys(units)
+    # A set with a unit that is checked in any case asks for nothing more.
+    others = [units for units in doubted if named.keys().isdisjoint(units)]
+    if named:
+        are = "is" if len(named) == 1 else "are"
+        work = (
+            "checked for a loose mounting" if _shakes(judgement, named) else "checked"
+        )
+        units = [name for name in dict.fromkeys(unit_of.values()) if name in named]
+        steps = [f"{listed(units)} {are} {work} or replaced"]
+    else:
+        steps = []
+    if others:
+        all_of_them = dict.fromkeys(name for units in others for name in units)
+        steps.append(
+            f"{listed(list(all_of_them))} are compared at rest and in turns: one is faulty"
+        )
+    return f"Do not fly before {', and '.join(steps)}."
+
+
+def _shakes(judgement: Judgement, units: Collection[str]) -> bool:
+    """Whether noise explains all declarations, and is of one of some units."""
+    noisy = {name for one in noise_behind(judgement) for name in one.who}
+    return any(
+        one.name in noisy and (one.unit or one.name) in units
+        for one in judgement.monitor.channels
+    )
 
 
 def noise_behind(judgement: Judgement) -> list[Concern]:
@@ -268,7 +310,7 @@ def _when(one: Episode) -> str:
     if one.state == "STALE":
         return f"gives no data {since}"
     if one.state == "AMBIGUOUS" and len(one.channels) == 1:
-        return f"{since}, not yet confirmed"
+        return f"{since}, not confirmed"
     return since
 
 
@@ -353,8 +395,7 @@ def _size(size: Size, unit: Unit) -> str:
 
 def _is_plain(size: Size) -> bool:
     """Whether an error keeps its sign, and its size grows if its course does."""
-    grows = abs(size.last_rad_s) > abs(size.rad_s)
-    return size.rad_s * size.last_rad_s > 0.0 and grows == (size.course == "growing")
+    return course_word(size) == size.course
 
 
 def _signed(value: float, std: float, unit: Unit) -> str:

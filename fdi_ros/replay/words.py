@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import astuple
 from typing import Any
 
 from fdi_ros.config.unit_names import short_names
@@ -119,7 +120,7 @@ def unchecked_words(channels: Sequence[ChannelResult]) -> str:
         if not since[-1]:
             when = "from the start"
         elif len(since) > 1:
-            when = f"since {since[-1]:.3f} s at the latest"
+            when = f"since {since[0]:.1f} to {since[-1]:.1f} s"
         else:
             when = f"since {since[0]:.3f} s"
         names = listed(short_names([one.name for one in group]))
@@ -184,8 +185,11 @@ def sample_rate_notes(rate: SampleRate) -> list[str]:
 def _detection_words(fault: Outcome) -> str:
     """Describe detection and isolation of an injected fault."""
     if fault.detected_at_s is None:
-        before = "not counted, because its channels were already declared"
-        return before if fault.declared_before else "not detected"
+        if fault.declared_before:
+            return "not counted, because its channels were already declared"
+        if fault.kind in ("noise", "spike"):
+            return "not declared faulty: noise and spikes are only reported"
+        return "not detected"
     words = f"detected after {_time(fault.delay_s)}"
     if fault.isolated_at_s == fault.detected_at_s:
         return f"{words}, isolated"
@@ -318,10 +322,10 @@ def _trouble_words(
     """Describe the troubles of a unit. A dash: none."""
     own = [one.name for one in channels]
     names = {unit, *own}
-    faults = [
+    own_episodes = [
         one for one in summary.story.episodes if not names.isdisjoint(one.channels)
     ]
-    words = [f"{one.state.lower()} from {one.start_s:.1f} s" for one in faults[:1]]
+    words = _count_words(own_episodes)
     for one in _beside_silence(summary):
         about = [name for name in own if name in one.who]
         if about and len(about) < len(own):
@@ -330,6 +334,24 @@ def _trouble_words(
         elif about or unit in one.who:
             words.append(one.words)
     return "; ".join(words) or "-"
+
+
+def _count_words(episodes: Sequence[Episode]) -> list[str]:
+    """Describe the worst state in some episodes, and when it was. Empty: no episodes."""
+    for state in ("FAULTY", "AMBIGUOUS", "STALE"):
+        alike = [one for one in episodes if one.state == state]
+        if not alike:
+            continue
+        last = alike[-1]
+        until = "to the end" if last.stands else f"to {last.end_s:.1f} s"
+        if len(alike) == 1:
+            return [f"{state.lower()} from {last.start_s:.1f} s {until}"]
+        times = f"{state.lower()} {len(alike)} times"
+        return [
+            f"{times}, first from {alike[0].start_s:.1f} s,"
+            f" last from {last.start_s:.1f} s {until}"
+        ]
+    return []
 
 
 def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
@@ -344,11 +366,11 @@ def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
         "stop": lambda fault: number(fault.stop_s, "g", " s"),
         "detected": _detected,
         "delay": lambda fault: milliseconds(fault.delay_s),
-        "as": lambda fault: fault.detected_as or "-",
+        "detected as": lambda fault: fault.detected_as or "-",
         "isolated after": lambda fault: (
             milliseconds(fault.isolation_delay_s) if fault.isolated else "no"
         ),
-        "declared": lambda fault: ", ".join(fault.declared_channels) or "-",
+        "candidates": lambda fault: ", ".join(fault.declared_channels) or "-",
     }
     effect = scores.fault_effect_rad_s
     rows = [
@@ -362,12 +384,12 @@ def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
     hint = (
         "Difference (rms) from a replay without the faults; without saturated samples."
     )
-    return [
-        Section("Injected faults", "", head_and_rows(columns, scores.faults)),
-        Section(
-            "Effect of the faults on the rate", hint, (("rate", "rms effect"), rows)
-        ),
-    ]
+    faults = Section("Injected faults", "", head_and_rows(columns, scores.faults))
+    if not any(astuple(effect)):
+        # The faults are in accelerometers alone.
+        return [faults]
+    rates = ("rate", "rms effect"), rows
+    return [faults, Section("Effect of the faults on the rate", hint, rates)]
 
 
 def _detected(fault: Outcome) -> str:

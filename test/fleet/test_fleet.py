@@ -200,9 +200,12 @@ def test_first_stands_what_needs_a_person(fleet, tmp_path, capsys):
         tmp_path / "all.json",
     )
     said = capsys.readouterr().out.splitlines()
-    assert said[0] == "LOOK AT 2 of 5 flights: 1 faulty, 1 not judged."
+    assert (
+        said[0]
+        == "LOOK AT 2 of 5 flights: 1 FAULTY, 1 not judged. The other 3 are HEALTHY."
+    )
     assert said[1].startswith(
-        "2 vehicles; 1 flight could not be judged; 1 fault declared, in 1 flight; 0.01 hours"
+        "2 vehicles; 1 fault declared, in 1 flight; 0.01 hours judged"
     )
     assert said[2] == "1 recording could not be read whole."
     assert f"{fleet}/kite/c.mcap: FAULTY: imu_2.y from 5." in said[3]
@@ -226,11 +229,15 @@ def test_first_stands_what_needs_a_person(fleet, tmp_path, capsys):
         rest = [message for message in messages[2 * last :] if message[0] == TOPICS[0]]
         write_mcap(tmp_path / f"{name}.mcap", [*messages[: 2 * last], *rest])
     run(tmp_path / "o", tmp_path, "--config", fleet / "config.yaml")
-    assert (
-        capsys.readouterr().out.splitlines()[0] == "LOOK AT 1 of 2 flights: 1 faulty."
-    )
+    first, second = capsys.readouterr().out.splitlines()[:2]
+    assert first == "LOOK AT 1 of 2 flights: 1 FAULTY. The other 1 is HEALTHY."
+    assert "0 faults declared; in 1 flight a unit fell silent for good;" in second
     dies, _ = rows(tmp_path / "o")
-    assert re.fullmatch(r"FAULTY: imu_2 gives no data from 4\.\d s\.", dies["why"][0])
+    assert re.fullmatch(
+        r"FAULTY: imu_2 gives no data from 4\.\d s\. Do not fly before imu_2 is checked or"
+        r" replaced\.",
+        dies["why"][0],
+    )
     assert [one["state"] for one in rows(tmp_path / "o", "episodes")] == ["STALE"]
 
 

@@ -167,7 +167,9 @@ def test_a_fault_of_a_unit_is_one_episode_of_gyros_and_accelerometers(
     assert ("imu_3 (gyros and accelerometers)" in summary.verdict.sentence) == (
         count == 1
     )
-    assert summary.verdict.sentence.count("imu_3") == count
+    faults, _, advice = summary.verdict.sentence.partition(" Do not fly ")
+    assert faults.count("imu_3") == count
+    assert advice == "before imu_3 is checked or replaced."
     assert all(name.startswith("imu_3.") for name in summary.verdict.channels)
     assert "m/s^2" in summary_text(summary)
 

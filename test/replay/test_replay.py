@@ -135,7 +135,9 @@ def test_channels_that_die_are_named_and_fail_the_check(tmp_path):
     assert summary.scores.samples_judged > 0.5 * summary.scores.samples
     severity, words = summary.verdict.severity, summary.verdict.sentence
     assert severity is Severity.BAD
-    assert re.fullmatch(r"FAULTY: imu_2 gives no data from 4\.\d s\.", words)
+    first, _, advice = words.partition(" Do not fly ")
+    assert re.fullmatch(r"FAULTY: imu_2 gives no data from 4\.\d s\.", first)
+    assert advice == "before imu_2 is checked or replaced."
     second, *others = sentences(summary)
     assert re.fullmatch(
         r"Not checked at the end: imu_1 UNCHECKED since 4\.\d+ s \(most of .*\)\.",

@@ -178,7 +178,9 @@ def test_a_fault_is_one_plain_sentence(fault, sentence, fdi, tmp_path):
     first = fdi("replay", path).out.splitlines()[0]
     assert re.match(r"FAULTY: imu_1\.y .*from 1[2-9]\.\d s", first), first
     size = first.partition(" s. ")[2]
+    size, _, advice = size.partition(" Do not fly ")
     assert size.partition(" First seen")[0] == sentence
+    assert advice == "before imu_1 is checked or replaced."
 
 
 def residuals(noise, axes):
@@ -271,10 +273,14 @@ def oscillate(time, rates):
             freeze,
             r"FAULTY: imu_1, all axes, from (15|16|17|18|19)\.\d s\. Reason: frozen: has repeated one",
         ),
-        (lose_values, r"FAULTY: imu_1\.y from .*s\. Reason: its values come and go\.$"),
+        (
+            lose_values,
+            r"FAULTY: imu_1\.y from .*s\. Reason: its values come and go\. Do not fly before",
+        ),
         (
             oscillate,
-            r"FAULTY: .* from 15.* ms\b.* imu_1\.x had \d+ times the noise of the other units, from 1\d\.\d s on\.",
+            r"FAULTY: .* from 15.* ms\b.* imu_1\.x had \d+ times the noise of the other units, from 1\d\.\d s on\."
+            r" Do not fly before imu_1 is checked for a loose mounting or replaced\.$",
         ),
     ],
 )
