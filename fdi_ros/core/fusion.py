@@ -93,9 +93,12 @@ def choose_fused(
 ) -> int:
     """Return the channels to fuse."""
     usable = now.usable
+    # Before an alarm, an outlier of this sample is worse than a channel that returns.
+    outliers = 0 if now.verdict.alarm else now.evidence.outliers
     for i in range(settings.n):
-        if health.returning[i] and subsets[usable & ~(1 << i)].spare:
-            usable &= ~(1 << i)
+        rest = usable & ~(1 << i)
+        if health.returning[i] and subsets[rest & ~outliers].spare:
+            usable = rest
     trusted = usable & ~doubtful
     now.withheld = False
     if doubtful and not subsets[trusted].spare:

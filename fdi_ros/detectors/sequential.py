@@ -83,7 +83,7 @@ from fdi_ros.estimator.noise import (
     update_sample_variance,
     update_unknown,
 )
-from fdi_ros.estimator.outliers import find_outliers
+from fdi_ros.estimator.outliers import find_outliers, forget_doubt
 from fdi_ros.estimator.rest import REST_STD, update_rest
 from fdi_ros.estimator.shared_noise import (
     begin_shared,
@@ -154,6 +154,9 @@ def update_mask(params: Constants, state: State, sample: SampleInput) -> None:
     if case.open and blamed & ~sample.out == 0:
         forget_evidence(params, state)
         kf.mask = 0
+    for i in range(params.sensors.n):
+        if sample.out >> i & 1 and kf.doubt[i] > 0.0:
+            forget_doubt(kf, params.sensors.n)
     if sample.mask != kf.mask or sample.beyond != kf.beyond:
         kf.mask = sample.mask
         kf.beyond = sample.beyond
@@ -262,6 +265,7 @@ def forget_suspicion(params: Constants, state: State) -> None:
     state.cleared = False
     state.declared = 0
     forget_evidence(params, state)
+    forget_doubt(kf, params.sensors.n)
     forget_motion(kf, params.sensors.n)
     kf.mask = 0
 
@@ -328,7 +332,10 @@ def fill_verdict(
             # hypotheses give it.
             doubt = case.inference.error_products[i, j] if unsure else 0.0
             sample.estimate.covariance[i, j] = kf.at.covariance[i, j] + doubt
-        if unsure and kf.mask >> i & 1:
+        if (kf.mask & ~kf.judged) >> i & 1:
+            # The channels that it differed from are missing.
+            sample.estimate.covariance[i, i] += kf.doubt[i]
+        if (unsure and kf.mask >> i & 1) or kf.outliers >> i & 1:
             # Where no hypothesis explains a deviation, the deviation itself counts.
             innovation = kf.innovation[i]
             if innovation * innovation > THREE_SIGMA * (

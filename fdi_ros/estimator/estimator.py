@@ -173,6 +173,10 @@ class Estimator:
     outliers: Mask  # channels of the last sample that are too far off to be used in it
     spiked: Mask  # of these, those of a spike; all, if the culprit is not known
     spikes: Counts  # of each channel so far
+    # square of the last deviation of a channel from the others, (rad/s)^2, until they
+    # agree again or one is declared; 0: no deviation beyond noise
+    doubt: Channels
+    judged_at: Real  # time of the last sample with redundancy, s since the start
     clean: Parity  # without the outliers
     clean_values: Channels  # A y of that, s/rad
     clean_rate: Vector  # of that, rad/s

@@ -176,7 +176,8 @@ class SharedNoise:
     factor: Rates
     mixed: ByAxis  # c: mean products of that and A d
     apart: Channels  # d: mean squares of A d, s^2/rad^2
-    rate_sum: Vector  # of the samples of the block, rad/s
+    rate_count: Whole  # samples of the block in the next two sums
+    rate_sum: Vector  # rad/s
     rate_squares: Vector  # (rad/s)^2
     within: Vector  # variance of the rate within a block, about a line, (rad/s)^2
     vibration: Vector  # of the body about each axis, mean square, (rad/s)^2

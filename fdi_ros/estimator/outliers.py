@@ -17,6 +17,7 @@ import math
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.parity import UNKNOWN_RATE, apply_gain, fill_joint_parity
 from fdi_ros.estimator.estimator import (
+    LEAST_GAP,
     Constants,
     Estimator,
     correct_sample,
@@ -43,6 +44,12 @@ CLOSER = 0.25
 def find_outliers(params: Constants, kf: Estimator, values: Array) -> None:
     """Find the outliers of a sample, and correct the sample without possible spikes."""
     kf.outliers = kf.spiked = 0
+    if stays_in_doubt(params, kf):
+        # The rate may be that of the faulty channels alone: nothing is learned from it.
+        kf.spiked = kf.mask
+        for i in range(params.sensors.n):
+            kf.imputed[i] = kf.corrected[i]
+        return
     burst = 1.0
     farthest = 0.0
     for i in range(params.sensors.n):
@@ -67,6 +74,33 @@ def find_outliers(params: Constants, kf: Estimator, values: Array) -> None:
             end_spike(params, kf)
         return
     explain_outliers(params, kf, values, candidates, burst)
+
+
+@compiled
+def stays_in_doubt(params: Constants, kf: Estimator) -> bool:
+    """Update the doubt about each channel; return whether a sample in doubt is not checked at all.
+
+    All channels that disagree with a fault may be missing between its first samples.
+    """
+    doubted = False
+    for i in range(params.sensors.n):
+        if kf.judged >> i & 1:
+            square = kf.distance[i] * kf.distance[i]
+            usual = excess_of(kf, i) * kf.share[i] * kf.inflation[i]
+            far = square > OUTLIER * OUTLIER * usual
+            kf.doubt[i] = square / kf.parity.information[i, i] if far else 0.0
+        elif kf.mask >> i & 1:
+            doubted = doubted or kf.doubt[i] > 0.0
+    if kf.judged:
+        kf.judged_at = kf.seconds
+    return doubted and kf.judged == 0 and kf.seconds - kf.judged_at < LEAST_GAP
+
+
+@compiled
+def forget_doubt(kf: Estimator, n: int) -> None:
+    """End the doubt about all channels, because the evidence has decided."""
+    for i in range(n):
+        kf.doubt[i] = 0.0
 
 
 @compiled

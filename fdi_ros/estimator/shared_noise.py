@@ -82,6 +82,7 @@ def update_shared(params: Constants, kf: Estimator) -> None:
         return
     if kf.judged:
         update_covariance(params, kf)
+    shared.rate_count += 1
     for a in range(3):
         shared.rate_sum[a] += kf.rate[a]
         shared.rate_squares[a] += kf.rate[a] * kf.rate[a]
@@ -330,9 +331,16 @@ def update_common(shared: SharedNoise, adaptation_gain: float, count: int) -> fl
 
 @compiled
 def update_vibration(params: Constants, kf: Estimator) -> None:
-    """Find the mean square of the vibration of the body about each axis: what of the rate is too quick for motion."""
+    """Find the mean square of the vibration of the body about each axis: what of the rate is too quick for motion.
+
+    A block of which samples were left out, as spikes, shows nothing of the vibration.
+    """
     shared = kf.shared
     length = float(params.length)
+    share = params.adaptation_gain / MEMORY
+    if shared.rate_count != params.length:
+        share = 0.0
+    shared.rate_count = 0
     for a in range(3):
         noise = shared.alone.inverse[a, a]
         within = 0.0
@@ -346,9 +354,7 @@ def update_vibration(params: Constants, kf: Estimator) -> None:
             within = (
                 about - slope * slope * (length * length - 1.0) / (12.0 * length)
             ) / (length - 2.0)
-        shared.within[a] += (
-            params.adaptation_gain / MEMORY * (within - shared.within[a])
-        )
+        shared.within[a] += share * (within - shared.within[a])
         shared.rate_sum[a] = shared.rate_squares[a] = 0.0
         shared.vibration[a] = max(
             shared.within[a] - noise, shared.square[a, a] - noise, 0.0

@@ -142,3 +142,29 @@ def test_noise_beyond_the_settings_is_no_fault_for_a_method_that_learns_none():
     output = pipeline.process(Block(START + np.arange(3000) * 10 * MILLISECOND, z))
     assert not any(event.declares for event in output.events)
     assert output.alarm[500:].mean() < 0.002
+
+
+@pytest.mark.parametrize("late", [1, 2, 4])
+def test_while_two_units_disagree_one_alone_is_not_believed(late):
+    """For 0.12 s: imu_2.x is off by 1 rad/s, and imu_1 misses every second sample."""
+    time = np.arange(round(20.0 * RATE)) / RATE
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        pipeline = Pipeline(parallel(2, detector__name="sequential"))
+        z = np.hstack([0.3 * swung(time)] * 2)
+        z += random.normal(0.0, SIGMA, z.shape)
+        onset = 1500 + 7 * seed
+        z[onset:, 3] += 1.0
+        z[onset + late : onset + 12 : 2, :3] = np.nan
+        output = pipeline.process(
+            Block(START + np.arange(len(time)) * 10 * MILLISECOND, z)
+        )
+        error = np.abs(output.rate[:, 0] - 0.3 * swung(time)[:, 0])
+        std = np.sqrt(output.covariance[:, 0, 0])
+        disagree = slice(onset, onset + 16)
+        assert (error < 4.0 * std)[disagree].all()
+        assert std[onset - 200 : onset].max() < 0.02
+        if late == 1:
+            # imu_1 has returned before the alarm, and imu_2.x is the one that jumped.
+            assert error[onset + 2] < 0.05
+            assert std[onset + 2] < 0.05
