@@ -67,6 +67,7 @@ from fdi_ros.estimator.noise import (
     update_unknown,
 )
 from fdi_ros.estimator.snapshots import (
+    add_to_biases,
     is_after_hole,
     move_biases,
     predict_from,
@@ -301,6 +302,11 @@ def open_case(params: Constants, state: State, least: float) -> None:
     if case.onset == kf.hole_sample + 1:
         before = kf.hole_at
     predict_from(params, kf, before, kf.states)
+    # Stamps may be a block off.
+    if kf.seconds - since < kf.changed_at - BLOCK_TIME:
+        # Some samples since the onset belong to another specific force.
+        change = params.g_sensitivity * kf.largest_change
+        add_to_biases(params, kf.states, change, 0.0)
     name_channels(params, state)
     if case.open and case.inference.log_odds < least:
         copy_states(params.layout, case.before, kf.states)

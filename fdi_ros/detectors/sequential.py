@@ -192,7 +192,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     update_shared_level(params, kf)
     predict(params.layout, kf.states, kf.seconds - kf.learned_at)
     kf.learned_at = kf.seconds
-    renew_reference(params, kf)
+    follow_reference(params, state)
     if kf.blocks < FEWEST_BLOCKS:
         return
     kf.unseen = False
@@ -217,7 +217,8 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     # Without redundancy, errors show only at rest.
     if not holds and (kf.judged or kf.rest):
         learn(params, kf, weight)
-    if learns and not suspicious and kf.seconds - kf.snapshot_at >= SNAPSHOT_TIME:
+    quiet = learns and not suspicious and kf.force_variance == 0.0
+    if quiet and kf.seconds - kf.snapshot_at >= SNAPSHOT_TIME:
         kf.snapshot_at = kf.seconds
         keep_snapshot(params, kf)
     if learns:
@@ -227,6 +228,14 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
         update_excess(params, kf)
     if kf.all_blocks % BLOCKS_PER_COARSE == 0:
         look_for_slow_faults(params, state)
+
+
+@compiled
+def follow_reference(params: Constants, state: State) -> None:
+    """Let the biases belong to the specific force that lasts."""
+    if renew_reference(params, state.estimator, not state.case.open):
+        # The evidence so far belongs to other biases.
+        forget_evidence(params, state)
 
 
 @compiled

@@ -147,6 +147,7 @@ class Snapshot:
     seconds: Real  # since the start; negative: no snapshot
     states: ErrorStates
     late: Units  # delays that `restamp` made up for then, s
+    force: Vector  # specific force that the biases belong to, m/s^2
 
 
 @record
@@ -274,6 +275,8 @@ class Estimator:
     force: Vector  # smoothed specific force, m/s^2
     reference_force: Vector  # specific force that the biases belong to, m/s^2
     near_at: Real  # when the force was last near the reference, s since the start
+    changed_at: Real  # when the reference last changed, s since the start
+    largest_change: Real  # of the reference, m/s^2
     force_variance: Real  # of a gyro by g-sensitivity, lately largest, (rad/s)^2
     counted_variance: Real  # part of it that the covariance of samples contains
     rest_rates: Window  # of the last blocks, rad/s

@@ -7,8 +7,9 @@ The fused specific force of the accelerometers gives the change, and the sensiti
 each gyro is unknown. The biases belong to a reference force. At another force every
 gyro has an additional error, which is a variance of samples, blocks and means. If the
 other force lasts, it becomes the reference: the biases widen by that error, and the
-estimator learns them again. States for the sensitivities, three a gyro, would double
-the cost of a block.
+estimator learns them again. Where a force comes back, so do its biases: a fault that
+begins with a boost shows at its end. States for the sensitivities, three a gyro, would
+double the cost of a block.
 """
 
 from __future__ import annotations
@@ -18,7 +19,12 @@ import math
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.records import SampleInput
 from fdi_ros.estimator.estimator import Constants, Estimator, update_weights
-from fdi_ros.estimator.snapshots import move_biases
+from fdi_ros.estimator.snapshots import (
+    add_to_biases,
+    best_snapshot,
+    recall_biases,
+    variance_since,
+)
 
 LEAST_CHANGE = 9.8
 """Smallest change of the specific force that counts, m/s^2. The bias random walk covers
@@ -82,16 +88,28 @@ def count_growth(params: Constants, kf: Estimator) -> None:
 
 
 @compiled
-def renew_reference(params: Constants, kf: Estimator) -> None:
-    """Fade the variance after a block; make a specific force that lasts the reference of the biases."""
+def renew_reference(params: Constants, kf: Estimator, may_recall: bool) -> bool:
+    """Fade the variance after a block; make a specific force that lasts the reference of the biases.
+
+    Return whether the biases are those of a snapshot from that force.
+    """
     kf.force_variance *= FADE
     if kf.force_variance < NEGLIGIBLE:
         kf.force_variance = 0.0
     change = change_of_force(kf)
     if change == 0.0 or kf.seconds - kf.near_at < LASTS:
-        return
+        return False
     for a in range(3):
         kf.reference_force[a] = kf.force[a]
-    move_biases(params, kf, params.g_sensitivity * change, 0.0)
     kf.force_variance = 0.0
-    kf.near_at = kf.seconds
+    kf.near_at = kf.changed_at = kf.seconds
+    kf.largest_change = max(kf.largest_change, change)
+    std = params.g_sensitivity * change
+    best = best_snapshot(params, kf, kf.seconds)
+    if may_recall and best >= 0:
+        snapshot = kf.snapshots[best]
+        if variance_since(params, kf, snapshot) < std * std:
+            recall_biases(params, kf, snapshot)
+            return True
+    add_to_biases(params, kf.states, std, 0.0)
+    return False

@@ -26,6 +26,7 @@ from fdi_ros.estimator.estimator import (
     TIERS,
     Constants,
     Estimator,
+    Snapshot,
 )
 
 UNWATCHED, LONG_HOLE = 3e-4, 3600.0
@@ -46,6 +47,8 @@ def keep_snapshot(params: Constants, kf: Estimator) -> None:
         copy_states(params.layout, kf.states, snapshot.states)
         for u in range(params.units):
             snapshot.late[u] = kf.late[u]
+        for a in range(3):
+            snapshot.force[a] = kf.reference_force[a]
         kf.taken[tier] += 1
         if kf.taken[tier] % SNAPSHOTS != 1:
             return
@@ -119,23 +122,83 @@ def inflate_delays(params: Constants, kf: Estimator, units: int) -> None:
 
 
 @compiled
-def predict_from(
-    params: Constants, kf: Estimator, seconds: float, states: ErrorStates
-) -> bool:
-    """Predict the present states from the last snapshot before a time, s; return whether one exists."""
+def change_since(params: Constants, kf: Estimator, snapshot: Snapshot) -> float:
+    """Return the standard deviation of a bias by the change of the specific force since a snapshot, rad/s."""
+    square = 0.0
+    for a in range(3):
+        square += (kf.reference_force[a] - snapshot.force[a]) ** 2
+    return params.g_sensitivity * math.sqrt(square)
+
+
+@compiled
+def variance_since(params: Constants, kf: Estimator, snapshot: Snapshot) -> float:
+    """Return the variance of a bias by random walk and specific force since a snapshot, (rad/s)^2."""
+    walk = params.layout.walk[0]
+    change = change_since(params, kf, snapshot)
+    return (kf.seconds - snapshot.seconds) * walk * walk + change * change
+
+
+@compiled
+def best_snapshot(params: Constants, kf: Estimator, seconds: float) -> int:
+    """Find the snapshot until a time, s, since which the biases have changed least; -1: none.
+
+    This is the last one, unless the specific force was another one then.
+    """
     best = -1
-    latest = 0.0
+    least = latest = 0.0
     for tier in range(TIERS):
         for k in range(min(kf.taken[tier], SNAPSHOTS)):
             snapshot = kf.snapshots[tier * SNAPSHOTS + k]
-            if snapshot.seconds <= seconds and (best < 0 or snapshot.seconds > latest):
+            if snapshot.seconds > seconds:
+                continue
+            variance = variance_since(params, kf, snapshot)
+            better = variance < least or (
+                variance == least and snapshot.seconds > latest
+            )
+            if best < 0 or better:
                 best = tier * SNAPSHOTS + k
+                least = variance
                 latest = snapshot.seconds
+    return best
+
+
+@compiled
+def predict_from(
+    params: Constants, kf: Estimator, seconds: float, states: ErrorStates
+) -> bool:
+    """Predict the present states from the best snapshot until a time, s; return whether one exists."""
+    best = best_snapshot(params, kf, seconds)
     if best < 0:
         return False
     snapshot = kf.snapshots[best]
     copy_states(params.layout, snapshot.states, states)
     for u in range(1, params.units):
         states.x[params.layout.delays[u]] += snapshot.late[u] - kf.late[u]
-    predict(params.layout, states, kf.seconds - latest)
+    predict(params.layout, states, kf.seconds - snapshot.seconds)
+    add_to_biases(params, states, change_since(params, kf, snapshot), 0.0)
     return True
+
+
+@compiled
+def recall_biases(params: Constants, kf: Estimator, snapshot: Snapshot) -> None:
+    """Take the biases of a snapshot from the specific force that has come back."""
+    layout = params.layout
+    passed = kf.seconds - snapshot.seconds
+    change = change_since(params, kf, snapshot)
+    x = kf.states.x
+    p = kf.states.p
+    for r in range(layout.count):
+        if r < params.sensors.n:
+            x[r] = snapshot.states.x[r]
+        for c in range(layout.count):
+            if r < params.sensors.n and c < params.sensors.n:
+                p[r, c] = snapshot.states.p[r, c]
+            elif r < params.sensors.n or c < params.sensors.n:
+                p[r, c] = 0.0
+    for r in range(layout.count):
+        to = layout.feeds[r]
+        if r < params.sensors.n:
+            p[r, r] += passed * layout.walk[r] * layout.walk[r] + change * change
+        elif 0 <= to < params.sensors.n:
+            x[to] += passed * x[r]
+            p[to, to] += passed * passed * p[r, r]

@@ -62,6 +62,15 @@ def test_a_fault_is_named_before_in_and_after_a_boost(onset):
         assert 0.0 < faulty[0][0] - onset < 1.0
 
 
+def test_a_small_fault_that_begins_with_a_boost_is_named_after_its_end():
+    fault = f"channel=imu_2.y kind=bias size=0.06 start={BEGINS + 0.1}"
+    for seed in range(3):
+        events = declared(boosted(seed), fault)
+        faulty = [one for one in events if one[2] == ChannelState.FAULTY]
+        assert [name for _, name, _ in faulty] == ["imu_2.y"]
+        assert ENDS < faulty[0][0] < ENDS + 2.0
+
+
 def test_outside_boosts_a_fault_is_named_as_soon_as_without_g_sensitivity():
     block, _ = flight(900, size=0.3)
     fault = "channel=imu_2.y kind=bias size=0.1 start=6"
