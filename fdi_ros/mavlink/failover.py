@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from fdi_ros.mavlink.failover_evidence import CURRENT, SILENCE, Evidence
+from fdi_ros.mavlink.failover_evidence import SILENCE, Evidence
 from fdi_ros.mavlink.failover_file import FailoverFile, Saved
 from fdi_ros.mavlink.failover_policy import (
     VEHICLE,
@@ -27,6 +27,7 @@ from fdi_ros.mavlink.failover_policy import (
     objection,
 )
 from fdi_ros.mavlink.failover_probe import Probe, probe
+from fdi_ros.mavlink.failover_raw import CURRENT
 from fdi_ros.mavlink.failover_words import CONDITION_WORDS, imu_name, imu_text
 from fdi_ros.mavlink.protocol import ARDUPILOT, ENOUGH, MS, NS, ImuSample
 from fdi_ros.mavlink.report import INFO, TEXT_LENGTH, WARNING

