@@ -42,6 +42,8 @@ _OF_A_MONITOR = {
 DEFAULT_TIMEOUT = float(PARAMETERS["imus.timeout"].default)
 #: kinds of input, first those with stamps
 _PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
+#: share of the values of a gyro that are repeated for long, from which on to look
+MUCH_FROZEN = 0.1
 NEEDED = ", or ".join(
     f"two {kind.type.rpartition('/')[2]} topics"
     if kind.stamped
@@ -284,7 +286,8 @@ def recording_findings(
         *(("delivered", *one) for one in _slow_topics(chosen)),
     ]
     for what, topic, words in looks:
-        yield Finding(Role.WARNING, what, words, (topic,), headline="READY, BUT LOOK")
+        yield _look(what, words, (topic,))
+    yield from _bad_values(chosen)
     units = len(chosen) > 1
     names = [
         f"{shown(one.topic.name)} {place}" for one in chosen for place in one.places
@@ -296,17 +299,12 @@ def recording_findings(
     words = (
         f"{len(names)} channels in {f'{len(chosen)} units' if units else 'one array'}"
     )
-    words += f" at {figures(max(one.rate for one in chosen))} Hz"
+    words += f" at {figures(max(one.rate for one in chosen))} Hz can be judged"
     noise = np.concatenate([one.segments.noise().moving for one in chosen])
     if noisy := noisier_words(
         names, noise, [group.tolist() for group in groups], unit.name, unit.factor
     ):
-        yield Finding(
-            Role.WARNING,
-            "noise",
-            f"{noisy} from sample to sample; {words}",
-            headline="READY, BUT LOOK",
-        )
+        yield _look("noise", f"{noisy} from sample to sample; {words}")
     yield Finding(Role.WORTH, "ready", words, headline="READY")
     yield from topic_findings(chosen, unit)
 
@@ -333,6 +331,36 @@ def _slow_topics(chosen: Sequence[TopicReport]) -> Iterator[tuple[str, str]]:
             share = 100 * time / max(times)
             name = one.topic.name
             yield name, f"{shown(name)} delivered {share:.0f} % of its messages"
+
+
+def _bad_values(chosen: Sequence[TopicReport]) -> Iterator[Finding]:
+    """Yield gyros at the end of their range, and gyros that repeat one value for long."""
+    saturated = [
+        f"{shown(one.topic.name)} {place}"
+        for one in chosen
+        for place, count in zip(one.places, one.values.saturated, strict=True)
+        if count
+    ]
+    if saturated:
+        seconds = max(
+            float(one.values.saturated.max()) * one.interval for one in chosen
+        )
+        words = f"{listed(saturated)} measured the end of the range for {figures(seconds, 2)} s"
+        yield _look("end of range", words)
+    shares = {
+        shown(one.topic.name): float(one.repeats.count.max()) / one.received
+        for one in chosen
+    }
+    frozen = [name for name, share in shares.items() if share >= MUCH_FROZEN]
+    if frozen and not saturated:
+        share = max(shares[name] for name in frozen)
+        words = f"{listed(frozen)} repeat one value for long, in {share:.0%} of the messages"
+        yield _look("frozen", words)
+
+
+def _look(what: str, words: str, who: Sequence[str] = ()) -> Finding:
+    """Return a finding that asks for a look at a recording that can be judged."""
+    return Finding(Role.WARNING, what, words, who, headline="READY, BUT LOOK")
 
 
 def topic_findings(

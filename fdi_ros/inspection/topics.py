@@ -15,11 +15,13 @@ import numpy as np
 
 from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
+from fdi_ros.config.settings import LEAST_NOISE
 from fdi_ros.core.copies import copies_among
 from fdi_ros.core.messages import ENCAPSULATION, frame_of
 from fdi_ros.core.sources import Source, source_of_type
 from fdi_ros.inspection.repeats import Repeats
 from fdi_ros.inspection.segments import Noise, NoiseSegments
+from fdi_ros.inspection.values import Values
 from fdi_ros.model.quantity import FORCE
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.report.layout import (
@@ -100,6 +102,7 @@ class TopicReport:
     def expect(self, channels: int) -> None:
         """Expect messages with this number of values."""
         self.channels, self.repeats = channels, Repeats(channels)
+        self.values = Values(channels)
         self.segments = NoiseSegments(
             channels
         )  # of messages in which every value can be a rate
@@ -236,6 +239,7 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
         finite = np.isfinite(values)
         believed = np.abs(values) < BELIEVED
     report.repeats.add(values, report.interval)
+    report.values.add(np.where(believed, values, np.nan))
     report.not_finite += (~finite).sum(axis=0)
     report.beyond += (finite & ~believed).sum(axis=0)
     if believed.any():
@@ -325,11 +329,11 @@ def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:
     if (first := figures["start_ns"]) is not None:
         date = date_of(first)
         begun = (
-            f"{first * 1e-9:.1f} s after a start, date unknown"
+            f", no date, stamps from {first * 1e-9:.1f} s on"
             if date is None
-            else f"{date:%Y-%m-%d %H:%M:%S} UTC"
+            else f" from {date:%Y-%m-%d %H:%M:%S} UTC"
         )
-        words = f"{figures['duration_s']:.1f} s from {begun}"
+        words = f"{figures['duration_s']:.1f} s{begun}"
     return f"{shown(bag.name)}: {words}, {figures['size_bytes'] / 1e6:.1f} MB\n\n"
 
 
@@ -428,7 +432,12 @@ def topics_text(
     reports: Sequence[TopicReport], damage: Sequence[str], unit: Unit = RADIANS
 ) -> str:
     """Lay out the topics."""
-    notes = [f"note: {line}\n" for line in damage]
+    notes = [
+        f"note: {shown(report.topic.name)}: {', '.join(words)}\n"
+        for report in reports
+        if report.could_be_gyros and (words := troubles(report, unit))
+    ]
+    notes += [f"note: {line}\n" for line in damage]
     units = "rate: Hz; longest gap: s"
     if any(report.could_be_gyros for report in reports):
         units += (
@@ -443,7 +452,7 @@ def topics_text(
 
 
 def _gyros(report: TopicReport, unit: Unit) -> str:
-    """Describe a topic as possible gyros, with its troubles."""
+    """Describe a topic as possible gyros."""
     if not report.could_be_gyros:
         return "no"
     largest = f"up to {figures(report.largest * unit.factor)} {unit.name}"
@@ -465,10 +474,12 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     if (noise := report.force_noise) is not None and np.isfinite(noise.quiet).any():
         low = np.nanmin(noise.quiet)
         high = np.nanmax(noise.quiet)
+        size = f"noise {figures(low, 2)} to {figures(high, 2)} {FORCE.unit}"
+        constant = "constant values, not judged"
         words.append(
-            f"{report.channels} accelerometers, noise {figures(low, 2)} to {figures(high, 2)} {FORCE.unit}"
+            f"{report.channels} accelerometers, {size if high > LEAST_NOISE else constant}"
         )
-    return ", ".join([*words, *troubles(report, unit)])
+    return ", ".join(words)
 
 
 def burst_words(report: TopicReport) -> str:
@@ -480,10 +491,12 @@ def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
     """List the troubles with the values of a topic, by their places in the message."""
     beyond = f"beyond {figures(BELIEVED * unit.factor)} {unit.name}"
     words = []
+    saturated = report.values.saturated
     for why, counts in (
         ("not finite", report.not_finite),
         (beyond, report.beyond),
-        ("frozen", report.repeats.count),
+        ("at the end of the range", saturated),
+        ("one value for long", np.maximum(report.repeats.count - saturated, 0)),
     ):
         counted = zip(report.places, counts.tolist(), strict=True)
         words += (

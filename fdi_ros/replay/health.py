@@ -12,13 +12,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.raw import Batch
 from fdi_ros.core.states import ChannelState
-from fdi_ros.model.quantity import RATE, Quantity
-from fdi_ros.model.samples import Array, Block, Int
+from fdi_ros.model.samples import Array, Int
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.soundness import UnitHealth, own_noise
 
@@ -30,21 +28,17 @@ MESSAGES_IN_WINDOW = 20.0
 """Smallest mean number of messages in a window for a rate."""
 USUAL_QUANTILE = 0.9
 """Quantile of the counts of a unit that is its usual count, even if the unit is slow for long."""
+USUAL_SHARE = 0.9
+"""Share of the usual count from which on a window counts for the usual rate."""
 SLOW_SHARE = 0.6
 """Share of the usual count below which a unit is slow."""
 LEAST_SLOW = 3
 """Windows in a row that a unit is slow at least."""
 
-LEAST_RAIL = 4.0
-"""Smallest end of a range, rad/s. Gyros of 250 deg/s end at 4.36 rad/s."""
-LEAST_FORCE_RAIL = 19.0
-"""Smallest end of a range, m/s^2. Accelerometers of 2 g end at 19.6 m/s^2."""
 NOISE_WINDOW = 3.0
 """Duration of a window in which noise is measured, s: some swings of a loose mount."""
 LEAST_WINDOWS = 3
 """Smallest number of windows for a noise: fewer are dominated by the start-up."""
-RAIL_RUN = 5
-"""Consecutive samples at the largest value that show the end of a range."""
 
 
 class Delivery(NamedTuple):
@@ -118,9 +112,12 @@ class Deliveries:
         recorded = shares.max(axis=0)
         shares = shares[:, recorded > 0] / np.maximum(recorded[recorded > 0], 1e-9)
         times: Array = np.asarray(self._start + width * np.flatnonzero(recorded > 0))
+        # The quantile is a little more than the mean of the windows of a usual rate.
+        full = counts >= USUAL_SHARE * usual[:, None]
+        rates = (counts * full).sum(axis=1) / np.maximum(full.sum(axis=1), 1) / width
         return [
-            _delivery(np.asarray(np.minimum(own, 1.0)), times, width, count / width)
-            for own, count in zip(shares, usual.tolist(), strict=True)
+            _delivery(np.asarray(np.minimum(own, 1.0)), times, width, rate)
+            for own, rate in zip(shares, rates.tolist(), strict=True)
         ]
 
 
@@ -213,49 +210,3 @@ class UsualNoise:
             measured = np.isfinite(windows).sum(axis=0) >= LEAST_WINDOWS
             usual[measured] = np.nanmedian(windows[:, measured], axis=0)
         return usual
-
-
-class Values:
-    """Counts finite values and saturated samples of channels, block after block."""
-
-    def __init__(self, n: int, quantity: Quantity = RATE) -> None:
-        least = LEAST_RAIL if quantity == RATE else LEAST_FORCE_RAIL
-        self._largest = np.full(n, least)
-        self._run = np.zeros(n, dtype=np.int64)
-        """(n,) consecutive samples at the largest value."""
-        self.samples = 0
-        """Samples so far."""
-        self.finite: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
-        """(n,) samples with a finite value."""
-        self.saturated: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
-        """(n,) samples in runs at the largest value of the channel."""
-
-    def add(self, block: Block) -> None:
-        """Add the next samples."""
-        if not len(block):
-            return
-        known = np.isfinite(block.z)
-        self.samples += len(block)
-        self.finite += known.sum(axis=0)
-        size = np.where(known, np.abs(block.z), 0.0)
-        for i in np.flatnonzero(size.max(axis=0) >= self._largest).tolist():
-            self._add_saturated(i, size[:, i])
-        self._run[size[-1] < self._largest] = 0
-
-    def _add_saturated(self, i: int, size: Array) -> None:
-        """Count the samples of a channel at the end of its range."""
-        largest = float(size.max())
-        if largest > self._largest[i]:
-            self._largest[i] = largest
-            self._run[i] = 0
-            self.saturated[i] = 0
-        at_end = size == largest
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], at_end, [0]])))
-        for first, last in edges.reshape(-1, 2).tolist():
-            run = last - first + (int(self._run[i]) if first == 0 else 0)
-            if run >= RAIL_RUN:
-                counted = (
-                    run - (last - first) if run - (last - first) >= RAIL_RUN else 0
-                )
-                self.saturated[i] += run - counted
-            self._run[i] = run if last == len(size) else 0

@@ -29,6 +29,7 @@ from fdi_ros.config.config import Config
 from fdi_ros.core.sources import source_of
 from fdi_ros.faults.fault import Fault, Injector, fault_from, parse_fault
 from fdi_ros.inspection.starting_config import assumed_config, starting_config_of
+from fdi_ros.inspection.values import Values
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
@@ -39,7 +40,6 @@ from fdi_ros.replay.episodes import STRETCH_GAP, Story, join_halves, pieces
 from fdi_ros.replay.health import (
     Deliveries,
     UsualNoise,
-    Values,
     with_context,
     with_delivery,
 )
@@ -222,7 +222,7 @@ class Judge(Walk):
             self._delivered[i] = block.stamp[np.isfinite(block.z[:, i])][-1]
         faulty = self.injector.apply(block)
         for values, half in zip(self._values, faulty.halves, strict=True):
-            values.add(half)
+            values.add(half.z)
         if self._reference is not None:
             # A saturated gyro is wrong in both streams, so that their difference means nothing.
             limit = np.array(self.pipeline.config.health.max_rate)

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from fdi_ros.config.unit_names import short_names, unit_names
 from fdi_ros.faults.fault import Injector, parse_fault
+from fdi_ros.inspection.values import Values
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.soundness import (
@@ -27,7 +28,7 @@ from fdi_ros.monitor.soundness import (
     own_noise,
     word_of,
 )
-from fdi_ros.replay.health import MOST_WINDOWS, Deliveries, Values
+from fdi_ros.replay.health import MOST_WINDOWS, Deliveries
 from fdi_ros.replay.run import replay
 from fdi_ros.replay.words import sentences
 
@@ -96,6 +97,28 @@ def test_the_first_line_of_a_case(file, code, sentence, fdi, tmp_path):
     assert said.code == code
     verdict = json.loads(told.read_text())["verdict"]
     assert (verdict["words"], verdict["word"]) == (first, first.partition(":")[0])
+
+
+@needs_cases
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        (
+            CASES / "all_saturate_2000dps.csv",
+            "/imu_0 z, /imu_1 z and /imu_2 z measured the end of the range for 1.8 s",
+        ),
+        (
+            SITL / "calm.tlog",
+            "/imu_1, /imu_2 and /imu_3 repeat one value for long, in 67% of the messages",
+        ),
+    ],
+)
+def test_inspect_asks_for_a_look_where_a_replay_will(file, words, fdi):
+    if not file.exists():
+        pytest.skip(f"needs {file}, which is not here")
+    result = fdi("inspect", file)
+    assert result.out.splitlines()[0] == f"READY, BUT LOOK: {words}"
+    assert result.code == 4
 
 
 @needs_cases
@@ -349,9 +372,8 @@ def test_the_end_of_a_range_is_counted_however_blocks_are_cut(cut):
     z = np.tile(body, 3) + random.normal(0.0, 0.003, (5000, 9))
     z[1000:1200, 0] = 8.0
     values = Values(TRIADS.n)
-    stamp = (time * 1e9).astype(np.int64)
     for first in range(0, 5000, cut):
-        values.add(Block(stamp[first : first + cut], z[first : first + cut]))
+        values.add(z[first : first + cut])
     assert values.saturated.tolist() == [200] + 8 * [0]
 
 

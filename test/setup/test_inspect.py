@@ -118,7 +118,7 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
         [0, 0, 0],
     ]
     text = topics_text(reports, damage)
-    assert "frozen: 150 of x and 200 of z" in text
+    assert "one value for long: 150 of x and 200 of z" in text
     assert "1 malformed" in text
     assert "1 stamps do not increase" in " ".join(text.split())
 
@@ -233,14 +233,10 @@ def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, fdi, refused):
         tmp_path / "bag.mcap", sorted(messages, key=lambda message: message[1])
     )
     shown = fdi("inspect", path).out
-    assert (
-        "3 gyros, none with a rate, not finite: 20 of x and 20 of y and 20 of z\n"
-        in shown
-    )
-    assert (
-        "3 gyros, none with a rate, beyond 1000000 rad/s: 20 of x and 20 of y and 20 of z\n"
-        in shown
-    )
+    assert shown.count("3 gyros, none with a rate") >= 2
+    all_of_them = "20 of x and 20 of y and 20 of z\n"
+    assert f"note: /nan: not finite: {all_of_them}" in shown
+    assert f"note: /huge: beyond 1000000 rad/s: {all_of_them}" in shown
     made = tmp_path / "c.yaml"
     code, _, said = fdi("inspect", path, "--write", made, "--json", tmp_path / "j")
     assert (code, said.count("\n")) == (2, 1)
