@@ -258,6 +258,8 @@ class Failover:
                 return
             self._boots += 1
             self._forget()
+            self._probe = Probe.begin(len(self._values))
+            self._vehicle.denied.clear()
         self._late_since = None
         self._restarts = restarts
         self._booted = booted
@@ -281,8 +283,6 @@ class Failover:
     def _forget(self) -> None:
         self._values = [(None, 0)] * len(self._values)
         self._lanes = None
-        self._probe = Probe.begin(len(self._values))
-        self._vehicle.denied.clear()
 
     def _read(self, now: int) -> None:
         """Take the reports of parameters, and ask for the next."""

@@ -3,9 +3,9 @@
 
 """Whether an autopilot obeys: a pure function finds this out before an order is needed.
 
-Each INS_USE that is 1 is set to 1, once in each conversation. ArduPilot reports a parameter
-that is set, also to the value that it has. The answer to a read is the same message, so
-the parameter is not read for a while before and after.
+Each INS_USE that is 1 is set to 1, once after each start of the autopilot. ArduPilot reports
+a parameter that is set, also to the value that it has. The answer to a read is the same
+message, so the parameter is not read for a while before and after.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Probe(NamedTuple):
 
     @classmethod
     def begin(cls, count: int) -> Probe:
-        """Return the state at the begin of a conversation about count IMUs."""
+        """Return the state after a start of the autopilot, of count IMUs."""
         return cls((None,) * count, after=(0,) * count)
 
 
