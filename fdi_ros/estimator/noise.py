@@ -53,6 +53,10 @@ QUIETEST = 0.1
 QUIETEST_BLOCK = 0.03
 # Largest ratio of a block variance to the expected one: such noise hides any fault.
 LOUDEST = 1e4
+ENDED = 0.35
+"""Ratio of the recent variance to the learned one below which loud noise has ended: with 64
+to 100 values in the average, white noise is rarely below 0.5. The learned variance then
+falls to the expected one as fast as the average, or a later fault would wait for it."""
 # Assumed ratio of the long-time variance to the block variance before it is measured.
 UNKNOWN_RATIO = 16.0
 # Slow noise is unknown again from this ratio of the squared rate to the largest so far.
@@ -75,6 +79,7 @@ LEARNED_IN = 64.0
 RECENT_BLOCKS = 4
 """Number of last blocks of which at least three show a burst of noise. An onset, even one
 that a filter spreads, or a spike is in two of them at most."""
+RECENT_GAIN = 0.04  # share of a block in the average of the last second of blocks
 SELECTED = 2.5
 """Variance of white noise over the second smallest of these, each without its largest
 step: 1.5 at 400 Hz, 3.0 at 100 Hz, 6.7 at 50 Hz."""
@@ -113,6 +118,7 @@ class Noise:
     largest_speed_squared: Real
     seen: Four  # values of each time scale so far
     recent_ratio: Channels  # variance over the last half second, over the learned one
+    recent_block: Channels  # the same of blocks, over the last second
     unknown: Channels  # by how much the variance of long times may still be larger
     loudest: Channels  # largest variance of a sample so far, (rad/s)^2
     since: Channels  # time since it became much larger than any before, s
@@ -192,7 +198,8 @@ def begin_noise(noise: Noise, n: int, expected: Array) -> None:
             levels.sample[i] = levels.block[i] = expected[i]
             for k in range(SCALES + LAGS):
                 levels.level[k, i] = 1.0
-        noise.recent_ratio[i] = noise.square[i] = noise.share[i] = 1.0
+        noise.recent_ratio[i] = noise.recent_block[i] = 1.0
+        noise.square[i] = noise.share[i] = 1.0
         noise.squares[0, i] = noise.squares[1, i] = 1.0
         noise.unknown[i] = 1.0 + UNKNOWN_RATIO
         noise.loudest[i] = expected[i]
@@ -333,8 +340,18 @@ def update_sample_variance(
                 noise.now.sample[i] = max(
                     noise.now.sample[i] * factor, QUIETEST * expected[i]
                 )
+                if noise.recent_ratio[i] < ENDED:
+                    noise.now.sample[i] = fallen(
+                        noise.now.sample[i], adaptation_gain, expected[i]
+                    )
         noise.steps[i] = noise.energy[i] = noise.largest[i] = noise.counted[i] = 0.0
     update_degrees(noise, n, mask)
+
+
+@compiled
+def fallen(variance: float, share: float, expected: float) -> float:
+    """Return a learned variance that falls by a share, but not below the expected one."""
+    return max((1.0 - share) * variance, min(variance, expected))
 
 
 @compiled
@@ -394,6 +411,9 @@ def update_block_noise(
                     QUIETEST * noise.now.sample[i], QUIETEST_BLOCK * expected[i]
                 )
                 block = max(noise.now.block[i] * (1.0 + gain * (ratio - 1.0)), least)
+                noise.recent_block[i] += RECENT_GAIN * (ratio - noise.recent_block[i])
+                if noise.recent_block[i] < ENDED:
+                    block = fallen(block, RECENT_GAIN, expected[i])
                 noise.now.block[i] = min(block, LOUDEST * expected[i])
             noise.now.level[BLOCK, i] = noise.now.block[i] / noise.now.sample[i]
     noise.block_set = mask

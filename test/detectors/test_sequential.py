@@ -191,6 +191,37 @@ def test_noise_of_another_kind_is_no_fault(detector, streams):
         assert not detector().detect(z).alarm.any()
 
 
+def rows_to_name(spells):
+    """Mean samples until 10 SIGMA on imu_3.y are named, 3 s after the last spell of noise.
+
+    In each spell the gyros of imu_3 are 13 times as noisy as before. Nothing may be named
+    before the fault.
+    """
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    seconds = np.arange(0.0, 44.0, 1.0 / RATE)
+    onset = round(38.0 * RATE)
+    rows = []
+    for seed in range(6):
+        z = SIGMA * white(seed, len(seconds), 9)
+        for begin, end in spells:
+            z[(seconds > begin) & (seconds < end), 6:] *= 13.0
+        z[onset:, 7] += 10.0 * SIGMA
+        pipeline.restart()
+        output = pipeline.process(stamped(seconds, z))
+        faulty = output.state == ChannelState.FAULTY
+        assert not faulty[:onset].any()
+        assert not np.delete(faulty, 7, axis=1).any()
+        rows.append(np.argmax(faulty[:, 7]) - onset)
+    return np.mean(rows)
+
+
+def test_after_spells_of_noise_a_fault_is_named_nearly_as_soon_as_before():
+    usual = rows_to_name([])
+    assert 3 < usual < rows_to_name([(30.0, 35.0)]) < 2.0 * usual
+    often = [(k, k + 1.0) for k in range(12, 36, 2)]
+    assert rows_to_name(often) < 2.0 * usual
+
+
 def test_noise_that_grows_fivefold_within_two_seconds_names_nobody():
     growth = np.concatenate([np.geomspace(1.0, 5.0, 200), np.full(400, 5.0)])[:, None]
     for seed in range(20):
