@@ -23,11 +23,17 @@ from fdi_ros.mavlink.failover_policy import (
     PolicyState,
     View,
     decide,
-    is_apart,
-    objection,
 )
 from fdi_ros.mavlink.failover_probe import Probe, probe
 from fdi_ros.mavlink.failover_raw import CURRENT
+from fdi_ros.mavlink.failover_ready import (
+    EKF_LANES,
+    INS_USE,
+    MONITOR_LATE,
+    Facts,
+    doubt,
+    not_ready,
+)
 from fdi_ros.mavlink.failover_words import CONDITION_WORDS, imu_name, imu_text
 from fdi_ros.mavlink.protocol import ARDUPILOT, ENOUGH, MS, NS, ImuSample
 from fdi_ros.mavlink.report import INFO, TEXT_LENGTH, WARNING
@@ -35,9 +41,6 @@ from fdi_ros.mavlink.vehicle import Vehicle
 from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.system.clocks import Clocks
 
-INS_USE = ("INS_USE", "INS_USE2", "INS_USE3")
-#: Bit mask of the IMUs that have an EKF lane. ArduPilot takes it over at its start.
-EKF_LANES = "EK3_IMU_MASK"
 #: Failover compares more samples than the topics of the monitor get. At 50 Hz a gyro that
 #: vibrates with a multiple of 50 Hz seems to have a slow error. 111 Hz show the vibration
 #: up to half of that, and the multiples of 111 Hz hardly pass the autopilot's filter.
@@ -48,10 +51,6 @@ READ_HURRIED = 50 * MS  #: The same while an order may depend on the parameters,
 USE_KNOWN_FOR = 10 * NS  #: An older report of a parameter is not known any more, ns.
 #: A monitor without diagnostics for this time is in doubt, ns.
 REPORTED_WITHIN = 5 * NS
-LARGEST_AGE = 1.0  #: Age of the newest judged sample from which the monitor is late, s.
-LARGEST_LOSS = 0.1  #: Largest share of lost messages at which failover is ready.
-READY_TRIP = 300 * MS  #: Longest round trip at which failover is ready, ns.
-MONITOR_LATE = "the monitor is late"
 SIZING = 200 * MS  #: Longest wait of a text for the size of an error, ns.
 COUNTED = 5 * NS  #: Losses are counted over this time, ns.
 #: Readiness must have changed for this time to be announced, ns.
@@ -372,7 +371,11 @@ class Failover:
             more = self._counted[1] - lost
             self._lost = more / max(1, more + self._counted[2] - received)
         # An IMU that is out of use is announced by itself.
-        why = self._doubt(view, now) if self.out else self._not_ready(view, now)
+        why = (
+            doubt(view, self._facts(view, now))
+            if self.out
+            else self._not_ready(view, now)
+        )
         if why != self._ready[0]:
             self._ready = (why, now)
         is_late = why == MONITOR_LATE
@@ -389,63 +392,23 @@ class Failover:
             words = f"no failover: {why}" if why else fine
             self._say(WARNING if why else INFO, f"FDI: {words}"[:TEXT_LENGTH])
 
-    def _doubt(self, view: View, now: int) -> str:
-        """Return why no fault of any IMU would be answered now. Empty: no reason."""
-        trip = self._vehicle.sync.trip(now)
-        checks = (
-            (not self._is_same, f"failover_file is of system {self._system}"),
-            (not abs(self.age) <= LARGEST_AGE, MONITOR_LATE),
-            (self._lost > LARGEST_LOSS, "link loses messages"),
-            (self._is_slow(view, now), "IMUs come too slowly"),
-            (trip is None or trip > READY_TRIP, "link is slow"),
-            (not view.linked, "no ArduPilot that sends each IMU"),
-            (not view.monitored, "the monitor is in doubt"),
+    def _facts(self, view: View, now: int) -> Facts:
+        """Return what readiness depends on beside the view."""
+        return Facts(
+            age=self.age,
+            lost=self._lost,
+            trip=self._vehicle.sync.trip(now),
+            is_slow=self._is_slow(view, now),
+            other=None if self._is_same else self._system,
+            is_file_fine=not self._file.trouble,
+            has_lanes=self._lanes is not None,
+            obeys=self._probe.obeys,
         )
-        return next((words for holds, words in checks if holds), "")
 
     def _not_ready(self, view: View, now: int) -> str:
         """Return why a fault might go unanswered now. Empty: every fault would be answered."""
-        if doubt := self._doubt(view, now):
-            return doubt
-        memories = self._state.memories
-        names = [f"IMU {k + 1}" for k in range(len(memories))]
-        # Suppose each IMU in turn bad, with fresh reports, in flight.
-        imus = [imu._replace(heard=now if imu.heard else 0) for imu in view.imus]
-        against = []
-        for k, imu in enumerate(imus):
-            bad = imu._replace(blamed=True, size=math.inf, delivers=True)
-            trial = view._replace(armed=True, imus=(*imus[:k], bad, *imus[k + 1 :]))
-            against.append(objection(k, memories, trial, now, self._settings))
-        checks = [
-            (bool(why and imu.use), why)
-            for why, imu in zip(against, view.imus, strict=True)
-        ]
-        checks += [(not any(imu.use for imu in view.imus), against[0])]
-        for name, memory, imu in zip(names, memories, view.imus, strict=True):
-            apart = is_apart(imu, self._settings)
-            checks += [
-                (memory.without_notch, "reboot before flight"),
-                (imu.use is None, f"use of {name} is not reported"),
-                (imu.use is False, f"{name} not in use"),
-                (imu.blamed, f"{name} faulty and in use"),
-                (apart, f"{name} differs and is in use"),
-                (not imu.delivers, f"{name} sends nothing"),
-                (not memory.acquainted, f"{name} not seen to agree yet"),
-                (imu.agreed is None, f"{name} agrees with none"),
-                (not imu.judged, f"{name} is not judged"),
-                (not imu.lane, f"{EKF_LANES} is without {name}"),
-            ]
-        for name, obeys in zip(INS_USE, self._probe.obeys, strict=False):
-            checks += [
-                (obeys is False, f"the autopilot refuses {name}"),
-                (obeys is None, f"setting {name} is not answered"),
-            ]
-        checks += [
-            (self._lanes is None, f"{EKF_LANES} is not reported"),
-            (bool(self._file.trouble), "failover_file is not usable"),
-            (len(names) < 3, "two IMUs: no third to decide"),
-        ]
-        return next((words for holds, words in checks if holds and words), "")
+        facts = self._facts(view, now)
+        return not_ready(self._state.memories, view, facts, now, self._settings)
 
     def _is_slow(self, view: View, now: int) -> bool:
         """Return whether an IMU in use comes so slowly that vibration may look like an error."""

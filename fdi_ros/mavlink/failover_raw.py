@@ -96,6 +96,10 @@ class RawComparison:
         self._pairs: dict[tuple[int, int], deque[tuple[int, Vector]]] = {
             (j, k): deque(maxlen=256) for k in range(count) for j in range(k)
         }
+        # Whether the differences of each pair are a wave, and of which first and last this
+        # was judged.
+        self._judged = dict.fromkeys(self._pairs, (0, 0))
+        self._waves: dict[tuple[int, int], np.ndarray] = {}
         # Samples since the value of an IMU changed, and the rates of all IMUs at first.
         self._same = [0] * count
         self._repeating = max(FEWEST, REPEATING // interval)
@@ -252,7 +256,7 @@ class RawComparison:
         values = before[-self.fewest :]
         least = np.array(list(map(nearest_zero, values.T.tolist())))
         smooth = np.abs(_mean(values)) >= SMOOTHNESS * _roughness(values)
-        smooth &= ~self._vibrates(rows)
+        smooth &= ~self._vibrates(unit, other)
         turned = (2.0 * before * np.sign(least) < -np.abs(least)).any(axis=0)
         x, y, z = np.where(smooth & ~turned, least, 0.0).tolist()
         return x, y, z
@@ -289,7 +293,7 @@ class RawComparison:
         if (~steady & (np.abs(mean) >= spread)).any():
             steady |= _lasts(values, np.array(ages) // AVERAGED)
         if steady.any():
-            steady &= ~self._vibrates(rows)
+            steady &= ~self._vibrates(unit, other)
         x, y, z = (tuple(row.tolist()) for row in (mean, spread, std))
         return Difference(x, y, z, tuple(steady.tolist()))
 
@@ -301,18 +305,32 @@ class RawComparison:
         rows = self._pairs[min(unit, other), max(unit, other)]
         return list(rows) if rows and now - rows[-1][0] <= CURRENT else []
 
-    def _vibrates(self, rows: Sequence[tuple[int, Vector]]) -> np.ndarray:
+    def _vibrates(self, unit: int, other: int) -> np.ndarray:
         """Return which axes vibrate rather than differ. None do where no message is missing."""
-        times = np.array([at for at, _ in rows])
-        values = np.array([difference for _, difference in rows])
-        if len(rows) < JUDGED or np.diff(times).max() <= self._longest:
-            return np.zeros(3, dtype=bool)
-        age = (times[-1] - times) / NS
-        phase = 2.0 * np.pi * FREQUENCIES[:, None] * age
-        line = _unexplained(np.ones((1, len(age))), age[None], values)
-        wave = _unexplained(np.cos(phase), np.sin(phase), values)
-        vibrates: np.ndarray = line[0] > BETTER * wave.min(axis=0)
-        return vibrates
+        pair = min(unit, other), max(unit, other)
+        rows = self._pairs[pair]
+        ends = rows[0][0], rows[-1][0]
+        if self._judged[pair] != ends:
+            self._judged[pair] = ends
+            self._waves[pair] = _is_wave(rows, self._longest)
+        return self._waves[pair]
+
+
+def _is_wave(rows: Sequence[tuple[int, Vector]], longest: int) -> np.ndarray:
+    """Return which columns an oscillation explains better than a line, beside holes.
+
+    A hole is longer than longest, ns.
+    """
+    times = np.array([at for at, _ in rows])
+    if len(times) < JUDGED or np.diff(times).max() <= longest:
+        return np.zeros(3, dtype=bool)
+    values = np.array([difference for _, difference in rows])
+    age = (times[-1] - times) / NS
+    phase = 2.0 * np.pi * FREQUENCIES[:, None] * age
+    line = _unexplained(np.ones((1, len(age))), age[None], values)
+    wave = _unexplained(np.cos(phase), np.sin(phase), values)
+    is_wave: np.ndarray = line[0] > BETTER * wave.min(axis=0)
+    return is_wave
 
 
 def _unexplained(

@@ -36,8 +36,9 @@ from fdi_ros.core.messages import (
 from fdi_ros.core.sources import ChannelsSource
 from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import ConfigError
-from fdi_ros.mavlink.failover import INS_USE, OVERSAMPLING, Failover
+from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
 from fdi_ros.mavlink.failover_policy import PolicySettings
+from fdi_ros.mavlink.failover_ready import INS_USE
 from fdi_ros.mavlink.link import open_link, read_key
 from fdi_ros.mavlink.protocol import ImuSample, Thinning, system_ahead
 from fdi_ros.mavlink.report import Announcer, Reporter

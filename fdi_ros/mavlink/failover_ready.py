@@ -1,0 +1,131 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Whether failover is ready: a fault of any IMU in use would be answered now.
+
+Pure functions, which return the first reason against it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from fdi_ros.mavlink.failover_policy import (
+    Memory,
+    PolicySettings,
+    View,
+    is_apart,
+    objection,
+)
+from fdi_ros.mavlink.protocol import MS
+
+#: Parameters of the autopilot: 1 if it uses an IMU.
+INS_USE = ("INS_USE", "INS_USE2", "INS_USE3")
+#: Bit mask of the IMUs that have an EKF lane. ArduPilot takes it over at its start.
+EKF_LANES = "EK3_IMU_MASK"
+LARGEST_AGE = 1.0  #: Age of the newest judged sample from which the monitor is late, s.
+LARGEST_LOSS = 0.1  #: Largest share of lost messages.
+LONGEST_TRIP = 300 * MS  #: Longest round trip, ns.
+MONITOR_LATE = "the monitor is late"
+#: By whether the autopilot sets a parameter, as far as is known.
+ORDER_WORDS = {
+    False: "the autopilot refuses {}",
+    None: "setting {} is not answered",
+}
+
+
+class Facts(NamedTuple):
+    """All that counts beside the view and the memories of the policy."""
+
+    age: float = math.nan  #: Age of the newest judged sample, s. NaN: unknown.
+    lost: float = math.nan  #: Share of messages lost of late. NaN: unknown.
+    trip: int | None = None  #: Round trip, ns. None: unknown.
+    is_slow: bool = (
+        False  #: An IMU comes so slowly that vibration may look like an error.
+    )
+    other: int | None = None  #: System of the file, if the vehicle is another one.
+    is_file_fine: bool = True  #: The file can be read and written.
+    has_lanes: bool = True  #: `EKF_LANES` is reported.
+    #: Whether the autopilot sets INS_USE of each IMU. None: unknown.
+    obeys: tuple[bool | None, ...] = ()
+
+
+def doubt(view: View, facts: Facts) -> str:
+    """Return why no fault of any IMU would be answered now. Empty: no reason."""
+    trip = facts.trip
+    checks = (
+        (facts.other is not None, f"failover_file is of system {facts.other}"),
+        (not abs(facts.age) <= LARGEST_AGE, MONITOR_LATE),
+        (facts.lost > LARGEST_LOSS, "link loses messages"),
+        (facts.is_slow, "IMUs come too slowly"),
+        (trip is None or trip > LONGEST_TRIP, "link is slow"),
+        (not view.linked, "no ArduPilot that sends each IMU"),
+        (not view.monitored, "the monitor is in doubt"),
+    )
+    return next((words for holds, words in checks if holds), "")
+
+
+def not_ready(
+    memories: Sequence[Memory],
+    view: View,
+    facts: Facts,
+    now: int,
+    settings: PolicySettings,
+) -> str:
+    """Return why a fault might go unanswered at time now, ns. Empty: no reason."""
+    reasons = _reasons(memories, view, facts, now, settings)
+    return doubt(view, facts) or next(reasons, "")
+
+
+def _reasons(
+    memories: Sequence[Memory],
+    view: View,
+    facts: Facts,
+    now: int,
+    settings: PolicySettings,
+) -> Iterator[str]:
+    against = _objections(memories, view, now, settings)
+    for imu, why in zip(view.imus, against, strict=True):
+        if imu.use and why:
+            yield why
+    if not any(imu.use for imu in view.imus):
+        yield against[0]
+    for k, (memory, imu) in enumerate(zip(memories, view.imus, strict=True)):
+        name = f"IMU {k + 1}"
+        checks = (
+            (memory.without_notch, "reboot before flight"),
+            (imu.use is None, f"use of {name} is not reported"),
+            (imu.use is False, f"{name} not in use"),
+            (imu.blamed, f"{name} faulty and in use"),
+            (is_apart(imu, settings), f"{name} differs and is in use"),
+            (not imu.delivers, f"{name} sends nothing"),
+            (not memory.acquainted, f"{name} not seen to agree yet"),
+            (imu.agreed is None, f"{name} agrees with none"),
+            (not imu.judged, f"{name} is not judged"),
+            (not imu.lane, f"{EKF_LANES} is without {name}"),
+        )
+        yield from (words for holds, words in checks if holds)
+    orders = zip(INS_USE, facts.obeys, strict=False)
+    yield from (ORDER_WORDS[obeys].format(name) for name, obeys in orders if not obeys)
+    whole = (
+        (not facts.has_lanes, f"{EKF_LANES} is not reported"),
+        (not facts.is_file_fine, "failover_file is not usable"),
+        (len(memories) < 3, "two IMUs: no third to decide"),
+    )
+    yield from (words for holds, words in whole if holds)
+
+
+def _objections(
+    memories: Sequence[Memory], view: View, now: int, settings: PolicySettings
+) -> list[str]:
+    """Return what there would be against an order for each IMU, if it was bad in flight."""
+    # With fresh reports.
+    imus = [imu._replace(heard=now if imu.heard else 0) for imu in view.imus]
+    against = []
+    for k, imu in enumerate(imus):
+        bad = imu._replace(blamed=True, size=math.inf, delivers=True)
+        trial = view._replace(armed=True, imus=(*imus[:k], bad, *imus[k + 1 :]))
+        against.append(objection(k, memories, trial, now, settings))
+    return against

@@ -1,0 +1,71 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Readiness of failover: nothing unknown counts as good, and each reason has its sentence."""
+
+from typing import Any
+
+import pytest
+
+from fdi_ros.mavlink.failover_policy import Imu, Memory, PolicySettings, View
+from fdi_ros.mavlink.failover_ready import Facts, not_ready
+
+NS = 1_000_000_000
+NOW = 100 * NS
+GOOD = Imu(use=True, heard=NOW, named=False, ok=True, delivers=True, size=0.0, agreed=1)
+FACTS = Facts(age=0.02, lost=0.0, trip=20_000_000, obeys=(True,) * 3)
+
+
+def reason(
+    facts: dict[str, Any] | None = None,
+    memory: dict[str, Any] | None = None,
+    count: int = 3,
+    second: dict[str, Any] | None = None,
+    **view: Any,
+) -> str:
+    """Return the reason where all is good but what is given, of the second IMU too."""
+    imus = [GOOD] * count
+    imus[1] = GOOD._replace(**second or {})
+    memories = [Memory(seen=True, acquainted=True) for _ in range(count)]
+    for name, value in (memory or {}).items():
+        setattr(memories[1], name, value)
+    now = View(tuple(imus), linked=True, monitored=True)._replace(**view)
+    given = FACTS._replace(**facts or {})
+    return not_ready(memories, now, given, NOW, PolicySettings())
+
+
+def test_all_good_is_ready_and_two_imus_are_not() -> None:
+    assert reason() == ""
+    assert reason(count=2) == "two IMUs: no third to decide"
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"facts": {"age": float("nan")}}, "the monitor is late"),
+        ({"facts": {"age": -1.5}}, "the monitor is late"),
+        ({"facts": {"lost": 0.11}}, "link loses messages"),
+        ({"facts": {"trip": None}}, "link is slow"),
+        ({"facts": {"is_slow": True}}, "IMUs come too slowly"),
+        ({"facts": {"other": 7}}, "failover_file is of system 7"),
+        ({"facts": {"is_file_fine": False}}, "failover_file is not usable"),
+        ({"facts": {"has_lanes": False}}, "EK3_IMU_MASK is not reported"),
+        ({"facts": {"obeys": (True, None, True)}}, "setting INS_USE2 is not answered"),
+        (
+            {"facts": {"obeys": (True, False, None)}},
+            "the autopilot refuses INS_USE2",
+        ),
+        ({"linked": False}, "no ArduPilot that sends each IMU"),
+        ({"monitored": False}, "the monitor is in doubt"),
+        ({"second": {"use": None}}, "use of IMU 2 is not reported"),
+        ({"second": {"use": False}}, "IMU 2 not in use"),
+        ({"second": {"agreed": None}}, "IMU 2 agrees with none"),
+        ({"second": {"delivers": False}}, "IMU 2 sends nothing"),
+        ({"second": {"size": 0.05}}, "IMU 2 differs and is in use"),
+        ({"second": {"lane": False}}, "EK3_IMU_MASK is without IMU 2"),
+        ({"memory": {"acquainted": False}}, "IMU 2 not seen to agree yet"),
+        ({"memory": {"left_alone": True}}, "set by others"),
+    ],
+)
+def test_each_doubt_has_its_sentence(given: dict[str, Any], words: str) -> None:
+    assert reason(**given) == words
