@@ -38,6 +38,7 @@ from fdi_ros.bag.raw import (
     starts_with,
     unpack_message,
 )
+from fdi_ros.bag.ros1_message import converted_from_ros1
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.messages import read_bits
 from fdi_ros.core.sources import source_of_type
@@ -60,6 +61,8 @@ CHANNEL = int(Opcode.CHANNEL)
 MESSAGE = int(Opcode.MESSAGE)
 CHUNK = int(Opcode.CHUNK)
 STATISTICS = int(Opcode.STATISTICS)
+#: encoding of messages of ROS 1, as in a converted .bag
+ROS1 = "ros1"
 #: bytes of a record before its content: opcode, length of the content
 _PREFIX = 9
 #: bytes of a message record before the message: channel, sequence, log time, publish
@@ -169,6 +172,20 @@ def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
     return count, position
 
 
+def ros_type(name: str) -> str:
+    """Return the type of a message as ROS 2 writes it, from the names of other producers.
+
+    ROS 1 has ``sensor_msgs/Imu``, IDL ``sensor_msgs::msg::Imu``, and DDS
+    ``sensor_msgs::msg::dds_::Imu_``.
+    """
+    parts = name.replace("::", "/").split("/")
+    if len(parts) == 4 and parts[2] == "dds_":
+        parts = [*parts[:2], parts[3].removesuffix("_")]
+    if len(parts) == 2:
+        parts.insert(1, "msg")
+    return "/".join(parts)
+
+
 T = TypeVar("T")
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
@@ -205,6 +222,8 @@ class McapFile(BagFile):
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, str] = {}
         self._counts: dict[int, int] = {}
+        self._of_ros1: set[str] = set()
+        """Topics of gyros with messages of ROS 1."""
         self._found: list[Piece] = []
         self._scan()
         self._found.sort(key=lambda piece: piece.start_time)
@@ -225,14 +244,17 @@ class McapFile(BagFile):
             self._counts = dict(counts)
 
         self.topics = tuple(
-            Topic(
-                one.topic,
-                self._schemas.get(one.schema_id, ""),
-                one.message_encoding,
-                self._counts.get(number, 0),
-            )
-            for number, one in self._channels.items()
+            self._topic(number, one) for number, one in self._channels.items()
         )
+
+    def _topic(self, number: int, channel: Channel) -> Topic:
+        kind = ros_type(self._schemas.get(channel.schema_id, ""))
+        encoding = channel.message_encoding.lower()
+        if encoding == ROS1 and source_of_type(kind) is not None:
+            # Its messages are converted as they are read.
+            self._of_ros1.add(channel.topic)
+            encoding = "cdr"
+        return Topic(channel.topic, kind, encoding, self._counts.get(number, 0))
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
@@ -271,13 +293,16 @@ class McapFile(BagFile):
     def _unpacked(self, batch: Batch, topics: Sequence[str]) -> Iterator[Batch]:
         """Unpack messages compressed one by one (``--compression-mode message``).
 
-        Only types that may carry gyros are unpacked. Other messages are merely counted.
+        Messages of ROS 1 are converted to those of ROS 2. Only types that may carry gyros
+        are unpacked or converted. Other messages are merely counted.
         """
         types = {one.name: one.type for one in self.topics}
         gyros = [source_of_type(types.get(name, "")) is not None for name in topics]
         packed = np.any([starts_with(batch, head) for head in PACKED], axis=0)
         packed &= np.array(gyros, dtype=bool)[batch.topic]
-        if not packed.any():
+        of_ros1 = np.array([name in self._of_ros1 for name in topics], dtype=bool)
+        converted = of_ros1[batch.topic]
+        if not (packed | converted).any():
             yield batch
             return
         first = 0
@@ -289,6 +314,10 @@ class McapFile(BagFile):
                 if packed[k]:
                     message = unpack_message(message, min(CHUNK_BYTES, self._left))
                     self._left -= len(message)
+                if converted[k]:
+                    message = converted_from_ros1(
+                        message, types[topics[batch.topic[k]]]
+                    )
                 messages.append(message)
                 held += len(message)
                 if held > PORTION_BYTES:

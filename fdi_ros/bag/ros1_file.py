@@ -22,11 +22,10 @@ from typing import Any
 import lz4.frame
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros.bag.library_bag import LibraryBag, Message
 from fdi_ros.bag.raw import Damage, Topic
-from fdi_ros.core.sources import source_of_type
+from fdi_ros.bag.ros1_message import converted_from_ros1
 from fdi_ros.errors import BagError
 from fdi_ros.system.files import (
     CHUNK_BYTES,
@@ -74,7 +73,6 @@ class Ros1File(LibraryBag):
         # Stands for the path of a file that is open already.
         place: Any = SimpleNamespace(exists=lambda: True, open=lambda _: bounded)
         self._reader = Reader(place)
-        self._store = get_typestore(Stores.ROS2_JAZZY)
         try:
             self._reader.open()
             self._numbered = {
@@ -105,18 +103,10 @@ class Ros1File(LibraryBag):
         try:
             connections = [one for one in self._reader.connections if one.id in numbers]
             for connection, time, data in self._reader.messages(connections):
-                yield connection.id, time, self._converted(data, connection.msgtype)
+                message = converted_from_ros1(data, connection.msgtype)
+                yield connection.id, time, message
         except _ROS1_ERRORS as error:
             self.note(f"it is damaged ({error}): read up to there")
-
-    def _converted(self, data: bytes, kind: str) -> bytes:
-        """Convert a message to ROS 2. A damaged one becomes empty, which counts as malformed."""
-        if source_of_type(kind) is None:
-            return b""
-        try:
-            return bytes(self._store.ros1_to_cdr(data, kind))
-        except _ROS1_ERRORS:
-            return b""
 
     def _unpacked(self, unpacker: Callable[[], Any] | None, data: bytes) -> bytes:
         """Unpack a chunk."""

@@ -42,6 +42,8 @@ _OF_A_MONITOR = {
 DEFAULT_TIMEOUT = float(PARAMETERS["imus.timeout"].default)
 #: kinds of input, first those with stamps
 _PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
+#: largest share of messages recorded before the one ahead of them: a clock is set seldom
+MOST_DISORDERED = 0.1
 #: share of the values of a gyro that are repeated for long, from which on to look
 MUCH_FROZEN = 0.1
 NEEDED = ", or ".join(
@@ -119,7 +121,7 @@ def no_common_time(reports: Sequence[TopicReport]) -> str:
         longest = max(first - last for _, first, last in set_back) * 1e-9
         return (
             f"the last stamps of {names} are up to {figures(longest)} s before the first: a clock was"
-            " set while they were recorded"
+            " set while they were recorded, or the file is not in the order of time"
         )
     _, origin, end = spans[0]
     apart = [one for one in spans if one[1] > end or one[2] < origin]
@@ -205,7 +207,10 @@ def _unusable(report: TopicReport) -> str:
     if kind is None:
         return "its type carries no gyros"
     # The first that holds is the reason.
+    encoding = report.topic.encoding
     reasons = {
+        f"its messages are encoded as {shown(encoding) or 'nothing known'}, not as cdr": encoding
+        != "cdr",
         "no messages": not received,
         # The fused rate must not be its own witness.
         "a monitor has published it": report.topic.name.rpartition("/")[2]
@@ -216,6 +221,8 @@ def _unusable(report: TopicReport) -> str:
         f"all {received} messages are malformed, or have stamps before 1970": report.malformed
         == received,
         f"no message in which all values are finite and below {figures(BELIEVED)} rad/s": not report.complete,
+        "its messages are not in the order of time: sort the file": report.disordered
+        > MOST_DISORDERED * received,
         "a single message": received == 1,
         "its times of recording do not increase": not report.rate,
         f"it {report.copied}: {_NO_REDUNDANCY}": bool(report.copy_of),
@@ -251,6 +258,13 @@ def needs(reports: Sequence[TopicReport]) -> str:
     good = [name for name, words in why if not words]
     bad = [f"{name}: {words}" for name, words in why if words]
     usable = [f"usable: only {', '.join(good)}"] if good else []
+    if not why:
+        there = [
+            f"{shown(one.topic.name)} ({shown(one.topic.type) or 'no type'},"
+            f" {shown(one.topic.encoding) or 'no encoding'})"
+            for one in reports
+        ]
+        usable = [f"it has {first_of(there, 4)}" if there else "it has no topic"]
     return "; ".join(
         [NEEDED, *usable, *([first_of(bad, 8, "; ", "; and")] if bad else [])]
     )

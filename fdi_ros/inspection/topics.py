@@ -70,6 +70,8 @@ class TopicReport:
     longest: float = 0.0
     #: stamps that do not increase
     backward: int = 0
+    #: messages with a time of recording before that of the message ahead of them
+    disordered: int = 0
     #: lead of the first stamps over their times of recording, s, NaN if not stamped
     ahead: float = math.nan
     #: values in a message of possible gyros, else 0
@@ -278,6 +280,7 @@ def _take_times(report: TopicReport, times: Int) -> None:
     report.received += len(times)
     if not len(steps):
         return
+    report.disordered += int((steps < 0.0).sum())
     report.longest = max(report.longest, float(steps.max()))
     if report.received - len(times) < MOST_INTERVALS:
         report.intervals.append(steps)

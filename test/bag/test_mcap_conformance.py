@@ -11,8 +11,9 @@ import io
 import itertools
 import struct
 
+import numpy as np
 import pytest
-from bag.recordings import IMU, START, imu
+from bag.recordings import IMU, START, imu, write_mcap
 from mcap.writer import CompressionType, IndexType, Writer
 
 from fdi_ros.bag.reader import Recording
@@ -120,3 +121,106 @@ def test_a_file_of_another_version_is_refused(tmp_path):
     path.write_bytes(data.replace(b"\x89MCAP0", b"\x89MCAP1", 1))
     with pytest.raises(BagError, match="is not an MCAP file"):
         Recording(path)
+
+
+# Other producers
+
+
+TIMES = np.arange(0.0, 14.0, 0.02)
+
+
+def ros1_imu(stamp, rate):
+    """A sensor_msgs/Imu as ROS 1 serialises it."""
+    head = struct.pack("<III", 7, stamp // 10**9, stamp % 10**9)
+    frame = struct.pack("<I", 3) + b"imu"
+    zeros = [0.0] * 9
+    values = (0.0, 0.0, 0.0, 1.0, *zeros, *rate, *zeros, 0.0, 0.0, 0.0, *zeros)
+    return head + frame + struct.pack("<37d", *values)
+
+
+def produced(path, kind, schema, encoding, content, topic_by_topic=False, **options):
+    """Write three units, the second one off by 0.3 rad/s about y from 10 s on."""
+    random = np.random.default_rng(4)
+    turn = 0.4 * np.sin(np.outer(TIMES, (0.7, 1.0, 2.0)))
+    turn *= np.clip(TIMES - 4.0, 0.0, 1.0)[:, None]
+    messages = []
+    for k in range(3):
+        rates = turn + random.normal(0.0, 0.003, turn.shape)
+        rates[(TIMES >= 10.0) & (k == 1), 1] += 0.3
+        for time, rate in zip(TIMES, rates, strict=True):
+            at = START + round(1e9 * time)
+            messages.append((at, k, content(at, rate)))
+    if not topic_by_topic:
+        messages.sort(key=lambda one: one[0])
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=20_000, **options)
+        writer.start(profile="", library="another")
+        number = writer.register_schema(kind, schema, b"")
+        channels = [
+            writer.register_channel(f"/imu_{k}", encoding, number) for k in range(3)
+        ]
+        for at, k, data in messages:
+            writer.add_message(channels[k], at, data, at)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "schema", "encoding", "content", "options"),
+    [
+        ("sensor_msgs/msg/Imu", "ros2idl", "cdr", imu, {}),
+        ("sensor_msgs::msg::Imu", "omgidl", "cdr", imu, {"use_chunking": False}),
+        (
+            "sensor_msgs::msg::dds_::Imu_",
+            "omgidl",
+            "CDR",
+            imu,
+            {"compression": CompressionType.LZ4, "topic_by_topic": True},
+        ),
+        (
+            "sensor_msgs/Imu",
+            "ros1msg",
+            "ros1",
+            ros1_imu,
+            {"index_types": IndexType.NONE, "use_statistics": False},
+        ),
+    ],
+)
+def test_recordings_of_other_producers_are_judged(
+    kind, schema, encoding, content, options, tmp_path, fdi
+):
+    path = produced(tmp_path / "a.mcap", kind, schema, encoding, content, **options)
+    first = fdi("replay", path).out.splitlines()[0]
+    assert first.startswith("FAULTY: imu_1.y from 10.")
+
+
+@pytest.mark.parametrize(
+    ("kind", "encoding", "words"),
+    [
+        (
+            "sensor_msgs/msg/Imu",
+            "json",
+            "/imu_0: its messages are encoded as json, not as cdr",
+        ),
+        ("foxglove.Imu", "protobuf", "it has /imu_0 (foxglove.Imu, protobuf)"),
+    ],
+)
+def test_messages_that_are_not_read_are_named(kind, encoding, words, tmp_path, refused):
+    path = produced(tmp_path / "a.mcap", kind, "", encoding, lambda at, rate: b"{}")
+    assert words in refused("replay", path)
+
+
+def test_messages_in_no_order_are_no_higher_rate(tmp_path, refused):
+    random = np.random.default_rng(2)
+    messages = [
+        (
+            f"/imu_{k}",
+            START + round(1e9 * time),
+            imu(START + round(1e9 * time), (0,) * 3),
+        )
+        for time in TIMES
+        for k in range(3)
+    ]
+    random.shuffle(messages)
+    said = refused("replay", write_mcap(tmp_path / "a.mcap", messages))
+    assert "/imu_0: its messages are not in the order of time: sort the file" in said
