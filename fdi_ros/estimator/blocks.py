@@ -252,8 +252,16 @@ def largest_vibration(params: Constants, kf: Estimator) -> float:
         largest = max(largest, kf.shared.vibration[a])
         for i in range(params.sensors.n):
             largest = max(largest, hidden_vibration(params, kf, i, a, 1.0))
-    for i in range(params.sensors.n):
-        largest = max(largest, kf.incoherent[i] / (UNEQUAL * UNEQUAL))
+    return largest
+
+
+@compiled
+def unshared_vibration(params: Constants, kf: Estimator, i: int) -> float:
+    """Largest mean square of what the unit of channel i and the first do not share, (rad/s)^2."""
+    largest = 0.0
+    for j in range(params.sensors.n):
+        if params.unit[j] == 0 or params.unit[j] == params.unit[i]:
+            largest = max(largest, kf.incoherent[j])
     return largest
 
 
@@ -301,7 +309,9 @@ def keep_delay_variance(
     error = mean_variance(params, kf, i, math.sqrt(kf.noise.unknown[i]))
     error = max(error, kf.incoherent[i])
     turn = kf.angular_acceleration[i]
-    inside = 0.5 * vibration / (kf.span * kf.span)
+    # A delay is that against the first unit.
+    unshared = unshared_vibration(params, kf, i) / (UNEQUAL * UNEQUAL)
+    inside = 0.5 * max(vibration, unshared) / (kf.span * kf.span)
     least = unlearnable(error, inside, turn * turn)
     keep_least_variance(params.layout, i, TURN, least, kf.least_variance)
 

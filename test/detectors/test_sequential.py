@@ -346,7 +346,7 @@ def test_units_may_be_listed_in_any_order():
     """The second and the third of three units, the third with vibration of its own."""
     seconds = np.arange(0.0, 20.0, 1.0 / RATE)
     rng = np.random.default_rng(8)
-    vibration = own_vibration(seconds, rng)[:, 3:]
+    vibration = 0.3 * own_vibration(seconds, rng)[:, 3:]
     z = np.hstack([swing(seconds)] * 3) + SIGMA * white(8, len(seconds), 9)
     z[:, 6:] += (seconds > 5.0)[:, None] * vibration
     swapped = np.hstack([z[:, :3], z[:, 6:], z[:, 3:6]])
