@@ -49,15 +49,15 @@ CLEAR_DIFFERENCE = 0.5
 SCALE = 0.05
 #: An IMU that the monitor doubts agrees only while the difference scatters by less, rad/s.
 CALM = 0.1
-#: It agrees, and is trusted, only once another one has turned by this on average, rad/s: a
+#: An IMU agrees, and is trusted, only once another one has turned by this on average, rad/s: a
 #: dead gyro agrees with one at rest.
 TURN_RATE = 0.1
 #: One that was bad agrees only after a turn in which its error, if in proportion to the
 #: rate, would be this multiple of ``min_size``.
 SHOWN = 2.0
 #: Or a turn at this part of the rate at which it was seen to be bad. At 0.4 gyros that have
-#: lost a part of their scale agree for 13 % of the time, now for 5 %. At 1.0 half of those
-#: that have healed in a circle stay out.
+#: lost a part of their scale agree for 13 % of the time, now for 5 %. At 1.0 half of the
+#: healed ones stay out in a circle.
 SAME_TURN = 0.8
 TINY = 1e-3  #: Resolution of the messages, rad/s.
 #: An oscillation with this standard deviation is an error, rad/s.
@@ -110,7 +110,7 @@ class Track:
     #: States of its three channels. Empty: unknown.
     states: tuple[ChannelState, ...] = ()
     nearest: Vector = UNKNOWN_RATES  #: Difference to the nearest partner, rad/s.
-    bound: float = math.nan  #: A bound on it, rad/s.
+    bound: float = math.nan  #: A bound on that, rad/s.
     sizes: Vector = UNKNOWN_RATES  #: Largest difference of late, by axis, rad/s.
     #: Doubts of the monitor that agreement has refuted. None: the IMU is not trusted.
     refuted: set[ChannelState] | None = None
@@ -121,12 +121,12 @@ class Track:
     named: set[int] = field(default_factory=set)
     named_at: int = 0
     outdated: set[int] = field(default_factory=set)
-    agreed: int | None = None  #: Since when it agrees with another.
-    agreed_at: int = 0  #: When it last agreed.
-    #: Since when it has agreed in a turn that shows an error in proportion to the rate.
+    agreed: int | None = None  #: Since when the IMU agrees with another.
+    agreed_at: int = 0  #: When the IMU last agreed.
+    #: The same, from a turn that shows an error in proportion to the rate.
     turned: int | None = None
-    wrong: Wrong | None = None  #: How it was bad when it last was.
-    #: It has agreed in a turn since it was apart from all others.
+    wrong: Wrong | None = None  #: How the IMU was bad last.
+    #: Has agreed in a turn since the last time apart from all others.
     has_shown: bool = False
 
     @property
@@ -140,7 +140,7 @@ class Track:
         return DOUBTS.intersection(self.states)
 
     def axes(self, *wanted: ChannelState) -> set[int]:
-        """Return the axes to which the monitor gives one of these states."""
+        """Return the axes to which the monitor gives a wanted state."""
         return {axis for axis, state in enumerate(self.states) if state in wanted}
 
 

@@ -36,7 +36,7 @@ class Saved(NamedTuple):
     #: Time of the autopilot's start after that of this computer, s. NaN: unknown.
     after: float = math.nan
     computer: str = ""  #: Identity of that start of this computer. Empty: unknown.
-    #: Of those out of use, the ones that were so when the autopilot started.
+    #: IMUs out of use that were so when the autopilot started.
     without_notch: tuple[int, ...] = ()
 
     @property

@@ -225,7 +225,7 @@ class PolicyState(NamedTuple):
         ours
             IMUs, from 0, that the last run left out of use.
         without_notch
-            Those of them that were out of use when the autopilot started.
+            IMUs, from 0, that were out of use when the autopilot started.
         """
         memories = tuple(Memory() for _ in range(count))
         for k in ours:

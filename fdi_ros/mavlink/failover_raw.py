@@ -33,8 +33,8 @@ WINDOWS = 4
 #: An oscillation had the other sign, and half the size, within this time, ns.
 TURNED = 300 * MS
 #: Where messages are missing, holes may hide the same half of each period of a vibration.
-#: A difference is one if a frequency of these, Hz, explains it this many times as well as
-#: a straight line does. A vehicle itself swings more slowly.
+#: A difference is one if a sine of one frequency, Hz, leaves less than a `BETTER`-th of the
+#: squares that a straight line leaves. A vehicle itself swings more slowly.
 FREQUENCIES = np.arange(4.0, 50.0, 0.25)
 BETTER = 4.0
 JUDGED = 12  #: Fewest differences of which this is asked: fewer suit any frequency.
@@ -42,7 +42,7 @@ SKEW = 20 * MS  #: Two IMUs may measure this far apart in time, ns.
 #: Allowed for in a mean difference, ns: more would hide errors while the vehicle shakes.
 USUAL_SKEW = 5 * MS
 #: The last samples must all differ by `LARGE_DIFFERENCE` or `CLEAR_DIFFERENCE`: those of
-#: at least this time, ns, and at least `FEWEST` of them.
+#: at least this time, ns, and at least `FEWEST`.
 QUICK = 50 * MS
 FEWEST = 3  #: Smallest number of samples in `QUICK`.
 #: A gyro is stuck if it repeats one value for this time, ns, while the rates of two others
@@ -108,7 +108,7 @@ class RawComparison:
         self._out: tuple[int, ...] = ()  # IMUs out of use, which may scatter
 
     def leave_out(self, out: Sequence[int]) -> None:
-        """Take the IMUs out of use: one of them alone proves no motion."""
+        """Take the IMUs out of use: one alone proves no motion."""
         if tuple(out) != self._out:
             self._out = tuple(out)
             self._stuck = [False] * len(self._stuck)
