@@ -319,11 +319,17 @@ def open_case(params: Constants, state: State, least: float) -> None:
 
 @compiled
 def keep_information(params: Constants, state: State) -> None:
-    """Keep the information matrix of the last block beside its values."""
+    """Keep the information matrix of the last block beside its values.
+
+    A channel that went silent since that block has no value there, and no information.
+    """
+    kf = state.estimator
     kept = state.information[state.scales[BLOCK].newest]
+    known = kf.masks[1] & kf.judged
     for i in range(params.sensors.n):
         for j in range(params.sensors.n):
-            kept[i, j] = state.estimator.block_information[i, j]
+            both = known >> i & known >> j & 1
+            kept[i, j] = kf.block_information[i, j] if both else 0.0
 
 
 @compiled
@@ -637,6 +643,10 @@ def explain_mean(
 def isolate(params: Constants, kf: Estimator, case: Case) -> None:
     """Isolate the channels that all likely hypotheses have had in common for long enough."""
     inference = case.inference
+    if lacks_witnesses(case) and inference.common == case.isolated:
+        # Nothing is learned of the candidate: the time that it has stood pauses.
+        case.since += case.next - kf.samples
+        return
     if inference.common != case.candidate:
         case.candidate = inference.common
         case.since = kf.samples

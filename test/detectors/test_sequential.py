@@ -222,6 +222,23 @@ def test_after_spells_of_noise_a_fault_is_named_nearly_as_soon_as_before():
     assert rows_to_name(often) < 2.0 * usual
 
 
+@pytest.mark.parametrize("silent", [0.2, 0.5, 0.9])
+def test_a_unit_is_named_although_another_is_silent_for_a_while(silent):
+    """All axes of imu_2 are off from 20 s on, and imu_1 is silent for 0.6 s soon after."""
+    seconds = np.arange(0.0, 24.0, 1.0 / RATE)
+    z = SIGMA * white(7, len(seconds), 9) + np.tile(0.5 * swing(seconds), 3)
+    z[seconds >= 20.0, 3:6] += [0.5, -0.3, 0.2]
+    since = seconds - 20.0 - silent
+    z[(since >= 0.0) & (since < 0.6), :3] = np.nan
+    output = Pipeline(parallel(3, detector__name="sequential")).process(
+        stamped(seconds, z)
+    )
+    faulty = output.state == ChannelState.FAULTY
+    assert not np.delete(faulty, [3, 4, 5], axis=1).any()
+    assert not faulty[seconds < 20.5].any()
+    assert faulty[seconds > 22.0][:, 3:6].all()
+
+
 def test_noise_that_grows_fivefold_within_two_seconds_names_nobody():
     growth = np.concatenate([np.geomspace(1.0, 5.0, 200), np.full(400, 5.0)])[:, None]
     for seed in range(20):
