@@ -35,6 +35,7 @@ from fdi_ros.monitor.state_file import StateFile
 from fdi_ros.ros.node import CheckedNode
 from fdi_ros.ros.process import Stop
 from fdi_ros.ros.running import Running
+from fdi_ros.system.memory import give_back
 from fdi_ros.system.text import shown
 
 CHECK_PERIOD = 0.05  # period of the checks for silence and of saving a changed state, s
@@ -147,6 +148,8 @@ class MonitorNode(CheckedNode, LifecycleNode):
             return FAILURE
         self._running = Running(self, self._receiver, self._state_file)
         self._timer = self.every(CHECK_PERIOD, partial(self._check, self._running))
+        # Not active yet, so no sample waits for this.
+        give_back()
         return SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -177,6 +180,7 @@ class MonitorNode(CheckedNode, LifecycleNode):
             self.destroy_timer(self._timer)
             self._running.close()
         self._running = self._receiver = None
+        give_back()
         return SUCCESS
 
     on_shutdown = on_cleanup
