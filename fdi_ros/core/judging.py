@@ -56,6 +56,9 @@ def judge_sample(
     if row == UNPREPARED:
         return False
     clear_verdict(verdict, bank.n)
+    # What the method does not state of this sample is not that of an earlier one.
+    sample.estimate.is_current = False
+    sample.estimate.checked = 0
     if row == REFUSED:
         return True
     k = 0
@@ -71,7 +74,7 @@ def judge_sample(
             judged.error[k] = judged.noise[k] = 0.0
             judged.scores[k] = math.nan if bank.takes_any else 0.0
             k += 1
-    judged.alarm = judged.isolated = sample.estimate.is_current = False
+    judged.alarm = judged.isolated = False
     call(
         bank.judge,
         bank.constants,

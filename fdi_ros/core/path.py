@@ -243,12 +243,13 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     given.stamp = stamp
     given.out = out
     given.interrupted = now.evidence.interrupted
+    now.repeated = update_repeated(core)
+    # Old values are no values. The other channels continue to check each other.
+    given.mask &= ~now.repeated
     given.beyond = given.mask & ~now.usable
     given.in_recovery = (
         core.saturated and stamp - core.saturated_stamp <= settings.recovery_time
     )
-    now.repeated = update_repeated(core)
-    given.repeated = now.repeated != 0
     given.wants_excess = not settings.guard_declares
     now.all_repeat = all_repeat(settings, core.health, now, stamp)
     if now.all_repeat:
