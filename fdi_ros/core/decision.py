@@ -42,21 +42,25 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
     decision.suspicion = at_least(decision, settings, SUSPECTED, 1)
     # The first sample counts as interrupted: a restored set stands until it has been
     # clean for long enough.
-    if suspected or evidence.undecided or not evidence.judged or evidence.interrupted:
+    if (
+        suspected
+        or evidence.undecided
+        or evidence.unclear
+        or not evidence.judged
+        or evidence.interrupted
+    ):
         decision.last_doubt = evidence.stamp
     faulty, undecided = confirm(decision, settings)
     broken = (evidence.broken | evidence.intermittent) & ~decision.faulty
     faulty |= evidence.certain & ~decision.faulty
     if settings.by_evidence:
-        # A set by evidence ends with its evidence, a set by votes stays.
+        # A set by evidence ends with its evidence, a set by votes after `clean_time`
+        # without doubt. A member that nothing checks remains in doubt.
         decision.voted |= undecided
         if evidence.stamp - decision.last_doubt >= settings.clean_time:
             decision.voted = 0
-        wanted = (
-            (decision.voted | evidence.undecided)
-            if evidence.judged
-            else decision.ambiguous
-        )
+        lasting = evidence.unclear if evidence.judged else decision.ambiguous
+        wanted = decision.voted | evidence.undecided | lasting
     else:
         wanted = decision.ambiguous | undecided
     follow_declared(settings, decision, evidence)
@@ -68,8 +72,9 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
             decision.ambiguous != 0
             and evidence.stamp - decision.last_doubt >= settings.clean_time
         )
-    # A set is explained by a member that is now known to be faulty.
-    if clears or decision.ambiguous & (faulty | broken):
+    # A member that disagrees, is stuck or has drifted explains the set. One whose values
+    # are no numbers does not: another member may be wrong.
+    if clears or decision.ambiguous & faulty:
         decision.voted = wanted = 0
     after = (decision.faulty | faulty | broken) & ~returns
     decision.voted &= ~after

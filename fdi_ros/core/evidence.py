@@ -63,8 +63,25 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     evidence.intermittent = intermittent_channels(
         health.gone, health.leaves, settings.n, INTERMITTENT_SHARE
     )
+    evidence.unclear = unclear_members(core)
     clear &= now.usable
     return update_stuck(core, subsets, clear, evidence.stamp)
+
+
+@compiled
+def unclear_members(core: Core) -> int:
+    """Return the members of the set that have not agreed with others in this sample.
+
+    Nothing checks them, or they still repeat the value for which they are in the set. A
+    set of which the operator took out a channel has none.
+    """
+    decision = core.decision
+    evidence = core.now.evidence
+    if decision.ambiguous & core.excluded:
+        return 0
+    return int(
+        decision.ambiguous & ~evidence.checked | decision.voted & evidence.repeats
+    )
 
 
 @compiled

@@ -497,6 +497,7 @@ class Evidence:
     no_votes: Flag  # an alarm is suspicion only and counts towards no declaration
     interrupted: Flag  # a hole in the stream precedes this sample
     checked: Mask  # channels whose fault would have shown
+    unclear: Mask  # members of the set that have not agreed with others
     agrees: Mask  # channels that agree with the others, used for declared ones
     broken: Mask  # channels with only non-finite values for long
     flickers: Mask  # channels whose values seem to come and go
@@ -526,7 +527,8 @@ class Decision:
     error_count: Counts  # of its samples since then
     earlier_sum: Channels  # of its errors in the previous clean time, rad/s
     earlier_count: Counts  # of its samples in the previous clean time
-    last_doubt: Whole  # last sample with an alarm or without a verdict, ns
+    # last sample with an alarm, without a verdict, or with unclear members, ns
+    last_doubt: Whole
     suspicion: Mask  # named by an alarm in the window
 
 
