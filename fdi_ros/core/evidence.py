@@ -52,7 +52,9 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
         if not now.verdict.suspects[i]:
             clear |= 1 << i
         evidence.error[i] = now.corrected[i] - now.along[i]
-        if may_return and now.plain >> i & 1:
+        # Old values are no agreement: a stuck value is near the others at rest.
+        renewed = now.plain & ~now.repeated & ~evidence.repeats
+        if may_return and renewed >> i & 1 and not now.all_repeat:
             # In a usual geometry the prediction by n - 1 channels is at most as
             # uncertain as the channel itself.
             variance = 2 * variance_of(
