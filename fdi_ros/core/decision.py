@@ -168,14 +168,18 @@ def follow_declared(
         # The clean time of a channel begins at its declaration.
         is_declared = decision.faulty >> i & 1 and not settings.latch
         if not is_declared or evidence.interrupted or not evidence.agrees >> i & 1:
-            decision.last_bad[i] = decision.renewed[i] = evidence.stamp
-            decision.error_sum[i] = 0.0
-            decision.error_count[i] = 0
-            decision.earlier_sum[i] = 0.0
-            decision.earlier_count[i] = 0
+            restart_clean_time(decision, i, evidence.stamp)
         else:
             decision.error_sum[i] += min(max(evidence.error[i], -MAX_RATE), MAX_RATE)
             decision.error_count[i] += 1
+
+
+@compiled
+def restart_clean_time(decision: Decision, i: int, stamp: int) -> None:
+    """Let the clean time of a channel begin at this stamp, ns."""
+    decision.last_bad[i] = decision.renewed[i] = stamp
+    decision.error_sum[i] = decision.earlier_sum[i] = 0.0
+    decision.error_count[i] = decision.earlier_count[i] = 0
 
 
 @compiled

@@ -24,7 +24,13 @@ from fdi_ros.core.acceleration import differentiate_rate
 from fdi_ros.core.algebra import along
 from fdi_ros.core.bias import IN_MOTION, NOT_AT_REST, begin_in_motion, update_bias
 from fdi_ros.core.copies import update_copies
-from fdi_ros.core.decision import CHECKED, at_least, decide, forget_kind
+from fdi_ros.core.decision import (
+    CHECKED,
+    at_least,
+    decide,
+    forget_kind,
+    restart_clean_time,
+)
 from fdi_ros.core.evidence import fill_suspects, gather_evidence
 from fdi_ros.core.fusion import fuse
 from fdi_ros.core.halves import give_force, give_sample
@@ -499,8 +505,12 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
 def skip_sample(core: Core) -> None:
     """Write the result of a sample that only served to learn the bias."""
     last = core.last
-    forget_kind(core.decision, core.settings, CHECKED)
+    decision = core.decision
+    forget_kind(decision, core.settings, CHECKED)
+    # Nothing was compared, so no channel has agreed.
+    decision.last_doubt = last.stamp
     for i in range(core.settings.n):
+        restart_clean_time(decision, i, last.stamp)
         core.reference[i] = last.residual[i] = math.nan
     update_states(core, 0, 0, True)
     last.instant = max(last.stamp, last.instant + 1)
