@@ -505,7 +505,10 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
 def skip_sample(core: Core) -> None:
     """Write the result of a sample that only served to learn the bias."""
     last = core.last
+    now = core.now
     decision = core.decision
+    now.repeated = now.noisy = now.evidence.flickers = 0
+    now.all_repeat = now.withheld = core.sample.estimate.is_current = False
     forget_kind(decision, core.settings, CHECKED)
     # Nothing was compared, so no channel has agreed.
     decision.last_doubt = last.stamp
