@@ -37,7 +37,7 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
     push(
         decision,
         settings,
-        (doubtful, counted, counted if evidence.isolated else 0, evidence.checked),
+        (doubtful, counted, counted & evidence.isolated, evidence.checked),
     )
     decision.suspicion = at_least(decision, settings, SUSPECTED, 1)
     # The first sample counts as interrupted: a restored set stands until it has been

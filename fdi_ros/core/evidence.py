@@ -106,15 +106,17 @@ def fill_suspects(core: Core, stuck: int) -> None:
         # The driver or the bus repeats all values of the unit: no channel is worse than
         # the others.
         if settings.members[u] & stuck & now.repeated:
-            stuck |= settings.members[u]
+            stuck |= settings.members[u] & now.in_use
     update_drifted(settings, core.sample, now)
     evidence.certain |= evidence.drifted
+    evidence.suspected = evidence.isolated = 0
+    if not settings.by_evidence:
+        evidence.suspected = bits_of(verdict.suspects, n)
+        evidence.isolated = evidence.suspected if verdict.isolated else 0
     add_stuck(settings, now, stuck)
-    evidence.suspected = bits_of(verdict.suspects, n)
-    evidence.isolated = verdict.isolated
-    if settings.by_evidence:
-        evidence.suspected = stuck
-        evidence.isolated = stuck & (stuck - 1) == 0
+    evidence.suspected |= stuck
+    if stuck & (stuck - 1) == 0:
+        evidence.isolated |= stuck
 
 
 @compiled

@@ -489,7 +489,7 @@ class Evidence:
     # suspects of the verdict, or, if accumulated evidence decides, stuck channels
     suspected: Mask
     outliers: Mask  # channels too far off to be used now, without a declaration
-    isolated: Flag  # every suspect is faulty
+    isolated: Mask  # suspects each of which is faulty
     certain: Mask  # channels that are faulty by accumulated evidence
     undecided: Mask  # a set that contains a faulty one, by accumulated evidence
     drifted: Mask  # channels whose bias is certainly beyond `max_drift`

@@ -181,8 +181,6 @@ def update_stuck(core: Core, subsets: NDArray[Any], mask: int, stamp: int) -> in
 def add_stuck(settings: PathSettings, now: Current, evidence: int) -> None:
     """Add stuck channels to the suspects of the verdict. Statistic and alarm stay unchanged."""
     verdict = now.verdict
-    if evidence and not verdict.alarm:
-        verdict.isolated = True
     for i in range(settings.n):
         if evidence >> i & 1:
             verdict.suspects[i] = True
