@@ -514,7 +514,8 @@ def skip_sample(core: Core) -> None:
     decision.last_doubt = last.stamp
     for i in range(core.settings.n):
         restart_clean_time(decision, i, last.stamp)
-        core.reference[i] = last.residual[i] = math.nan
+        core.witnesses[i] = 0
+        last.residual[i] = math.nan
     update_states(core, 0, 0, True)
     last.instant = max(last.stamp, last.instant + 1)
     for a in range(3):

@@ -643,7 +643,6 @@ class Current:
     disagreement: Channels
     doubt: Vector  # an error of the rate whose square is added to its covariance, rad/s
     shared_error: Axes  # C G', covariance of channel errors with the rate, (rad/s)^2
-    prediction: Channels  # of each channel by the others, rad/s, or NaN
     moved: Channels  # change of each channel since another one repeats its value, rad/s
     variance: Channels  # of noise and other errors of single samples, (rad/s)^2
     uncertainty: Channels  # `variance` plus that of the estimated errors, (rad/s)^2
@@ -680,11 +679,9 @@ class Core:
     turning: Turning
     decision: Decision
     excluded: Mask  # taken out by the operator
-    # prediction by the others when the present value of each channel first came, rad/s,
-    # or NaN
-    reference: Channels
-    witnesses: Counts  # channels that the reference of each is predicted from
-    # values of all channels at the time of each reference, rad/s
+    # other channels that measured when the present value of each channel first came
+    witnesses: Counts
+    # values of all channels at that time, rad/s
     reference_input: Square
     saturated: Flag  # a manoeuvre has driven a channel out of range
     saturated_stamp: Whole  # last sample with a saturated channel, ns

@@ -8,8 +8,8 @@ a defect after a much longer time, or if the others measure motion along this ch
 axis: then the channel is stuck, or the values of a whole unit are old.
 
 A fault at rest looks like motion to every quiet channel beside it. The others are
-therefore evidence of motion only if they agree. The same channels must have seen the
-whole motion, and their disagreement must be small beside the motion. The noise of a fine
+therefore evidence of motion only if they agree. The same channels must have seen its
+begin and its end, and their disagreement must be small beside the motion. The noise of a fine
 sensor never repeats. A channel that repeats values by habit is stuck only if no single
 one of the others can be the cause: without each other one, the rest must have measured the
 motion too. An alarm that does not isolate the channel that repeats forbids the
@@ -51,24 +51,6 @@ coarse steps ``stuck_time``, if longer: gyros without noise repeat in a steady t
 
 
 @compiled
-def leave_one_out(settings: PathSettings, now: Current, subset: Subset) -> None:
-    """Write the prediction of each channel by the others to ``now.prediction``, rad/s.
-
-    NaN if the others do not predict the channel.
-    """
-    axes = settings.sensors.axes
-    rate = now.others_rate
-    for i in range(settings.n):
-        expected = along(axes[i], rate)
-        share = subset.sensitivity[i]
-        if share > MIN_SENSITIVITY**2:
-            residual = now.input[i] - expected
-            now.prediction[i] = expected + residual - residual / share
-        else:
-            now.prediction[i] = expected if share == 0 else math.nan
-
-
-@compiled
 def largest_step(settings: PathSettings, health: Health, now: Current) -> float:
     """Return the largest known step of the quantised channels, rad/s."""
     step = 0.0
@@ -105,13 +87,11 @@ def is_confirmed(
 ) -> bool:
     """Return whether the others have measured motion along channel i, whichever channel is left out.
 
-    Each must have measured more than ``least``, rad/s, since channel i first had its value.
+    Each must have measured more than ``least``, rad/s, as ``now.moved`` shows.
     """
     now = core.now
     axes = core.settings.sensors.axes
     n = core.settings.n
-    for k in range(n):
-        now.moved[k] = now.input[k] - core.reference_input[i, k]
     for j in range(n):
         if others >> j & 1 and abs(along(axes[i], axes[j])) > MIN_SENSITIVITY:
             rest = others & ~(1 << j)
@@ -132,7 +112,12 @@ def has_moved(
     """
     now = core.now
     noise = core.settings.sensors.noise_std[i]
-    change = abs(now.prediction[i] - core.reference[i])
+    n = core.settings.n
+    for k in range(n):
+        now.moved[k] = now.input[k] - core.reference_input[i, k]
+    fill_rate(subsets[others], n, others, now.moved, now.others_rate)
+    change = abs(along(core.settings.sensors.axes[i], now.others_rate))
+    # Without a rate the comparison is false.
     if not (change > least + step and now.disagreement[i] < (AGREED * change) ** 2):
         return False
     by_habit = core.health.run_length[i] > USUAL_RUN or step > COARSE_STEP * noise
@@ -149,18 +134,17 @@ def update_stuck(core: Core, subsets: NDArray[Any], mask: int, stamp: int) -> in
     now = core.now
     stuck = 0
     subset = subsets[mask]
-    # Use uncorrected values: a change of the estimated errors is not motion.
-    fill_rate(subset, n, mask, now.input, now.others_rate)
-    leave_one_out(core.settings, now, subset)
     if now.evidence.repeats & now.usable:
         fill_disagreement(core.settings, now, subset, mask)
     step = largest_step(core.settings, core.health, now)
     for i in range(n):
         others = mask & ~(1 << i)
-        if core.health.run_stamp[i] == stamp or others != core.witnesses[i]:
-            core.reference[i] = now.prediction[i]
+        # A channel that comes gives no motion since before. One that misses single
+        # samples changes nothing.
+        if core.health.run_stamp[i] == stamp or others & ~core.witnesses[i]:
             core.witnesses[i] = others
             for j in range(n):
+                # Uncorrected values: a change of the estimated errors is not motion.
                 core.reference_input[i, j] = now.input[j]
         elif now.evidence.repeats & now.usable & (1 << i):
             isolated = now.verdict.suspects[i] and now.verdict.isolated
