@@ -55,6 +55,7 @@ class Reason(str, Enum):
     DRIFTED = "has drifted: its bias is beyond bias.max_drift"
     INTERMITTENT = "its values come and go"
     COPY = "gives the values of another unit: one sensor, no redundancy"
+    OLD = "its unit repeats old values while the others move"
 
 
 REASONS = tuple(Reason)
@@ -63,9 +64,8 @@ OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED, EXCLUDED = map(int, ChannelSta
 _NONE, _DISAGREES, _NON_FINITE, _OUT_OF_RANGE, _STUCK, _FROZEN, _NO_DATA, _TOO_FEW = (
     range(8)
 )
-_LATELY, _CANNOT_RUN, _BIAS, _OPERATOR, _ALL_REPEAT, _DRIFTED, _INTERMITTENT, _COPY = (
-    range(8, len(REASONS))
-)
+_LATELY, _CANNOT_RUN, _BIAS, _OPERATOR, _ALL_REPEAT, _DRIFTED = range(8, 14)
+_INTERMITTENT, _COPY, _OLD = range(14, len(REASONS))
 _SHOWN = (OK, OK, SUSPECT, SUSPECT, STALE, STALE, SUSPECT)
 """State by `Condition`, or OK if the condition implies none."""
 _OF_CONDITION = (
@@ -150,6 +150,10 @@ def reason_of(core: Core, subset: Subset, i: int) -> int:
         return why_unchecked(core, subset, i)
     if state == SUSPECT and core.now.evidence.flickers >> i & 1:
         return _INTERMITTENT
+    if state in (SUSPECT, AMBIGUOUS) and core.now.repeated >> i & 1:
+        return _OLD
+    if state == AMBIGUOUS and core.decision.voted & core.now.evidence.repeats >> i & 1:
+        return _STUCK
     return _OF_CONDITION[condition] if state == _SHOWN[condition] else _DISAGREES
 
 
