@@ -443,7 +443,7 @@ class HealthConfig:
     )
     stuck_time_at_rest: float = setting(
         10.0,
-        "stale when the value repeats for this long without motion; 0: off",
+        "stale when the value repeats for this long, also at rest; 0: off",
         "s",
         0.0,
         86400.0,

@@ -510,7 +510,7 @@ class Decider:
         self.stamp += 1
         told = {
             "suspected": mask_of(members),
-            "isolated": isolated and bool(members),
+            "isolated": mask_of(members) if isolated else 0,
             "judged": True,
             "checked": ALL,
         }
