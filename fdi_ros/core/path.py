@@ -43,7 +43,7 @@ from fdi_ros.core.judging import (
 )
 from fdi_ros.core.level import update_level
 from fdi_ros.core.records import Bank, Core, PathSettings, Sample
-from fdi_ros.core.repeated import all_repeat, update_repeated
+from fdi_ros.core.repeated import all_repeat, update_repeated, without_coarse_steps
 from fdi_ros.core.restamping import restamp
 from fdi_ros.core.states import alive, left_out, out_of_use, update_states, write_events
 from fdi_ros.core.subsets import fill_rate
@@ -251,7 +251,8 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     given.interrupted = now.evidence.interrupted
     now.repeated = update_repeated(core)
     # Old values are no values. The other channels continue to check each other.
-    given.mask &= ~now.repeated
+    given.mask &= ~without_coarse_steps(settings, core.health, now.repeated)
+    given.repeated = given.mask & now.repeated != 0
     given.beyond = given.mask & ~now.usable
     given.in_recovery = (
         core.saturated and stamp - core.saturated_stamp <= settings.recovery_time

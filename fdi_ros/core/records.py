@@ -220,6 +220,7 @@ class SampleInput:
     interrupted: Flag  # a hole in the stream precedes this sample
     # a manoeuvre has just driven a channel out of range: evidence is void
     in_recovery: Flag
+    repeated: Flag  # a unit seems to repeat old values in coarse steps: no evidence
     wants_excess: Flag  # another method is to judge the corrected values
     estimate: Estimate  # written by the estimator, valid until the next sample
 

@@ -209,6 +209,24 @@ def update_repeated(core: Core) -> int:
 
 
 @compiled
+def without_coarse_steps(settings: PathSettings, health: Health, found: int) -> int:
+    """Return those of the units found to repeat whose values are certainly old.
+
+    At rest values in coarse steps may all repeat while a fault of another unit looks like
+    motion.
+    """
+    old = found
+    for u in range(settings.units):
+        for i in range(settings.n):
+            step = health.step[i]
+            noise = settings.sensors.noise_std[i]
+            is_coarse = step == 0.0 or step > COARSE_STEP * noise
+            if is_coarse and settings.members[u] >> i & 1:
+                old &= ~settings.members[u]
+    return old
+
+
+@compiled
 def is_at_rest(settings: PathSettings, now: Current) -> bool:
     """Return whether the channels in use show a vehicle at rest."""
     least = RESTS * settings.largest_noise + AT_REST

@@ -393,6 +393,12 @@ def judge(
         verdict.statistic = 0.0
         sample.estimate.checked = 0
         return
+    if sample.repeated:
+        verdict.statistic = min(
+            math.log(1.0 + mean_of(params, state.estimator, state.scales)),
+            SHORT * verdict.threshold,
+        )
+        return
     update_shape(params, kf)
     process_sample(params, state, sample)
     if add_sample(params, kf, sample.z, seconds):
