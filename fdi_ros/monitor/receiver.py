@@ -194,6 +194,11 @@ class Receiver:
         )
         return self.go_on() if flags & MORE else flags
 
+    @property
+    def last_stamp(self) -> int:
+        """Stamp of the last sample that the monitor has processed, ns."""
+        return int(self.pipeline.core["last_stamp"][0])
+
     def go_on(self) -> int:
         """Work the next sample."""
         if self.pipeline.undecided:

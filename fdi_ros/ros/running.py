@@ -502,7 +502,7 @@ class Running:
         self._watchdog.measure(self._samples, now)
         self._at_once = MAX_AT_ONCE
         was_wrong = self._rate_check.words
-        self._rate_check.check(self._samples, int(self.receiver.live["last_stamp"][0]))
+        self._rate_check.check(self._samples, self.receiver.last_stamp)
         if self._rate_check.words and not was_wrong:
             self._node.log.warning(self._rate_check.words)
 

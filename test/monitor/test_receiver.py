@@ -193,3 +193,14 @@ def test_a_detector_that_is_replaced_under_way_is_the_one_that_is_asked():
     assert len(ear.integrity) >= 99
     assert len(set(thresholds[1:])) == len(names)
     assert pipeline.status().detector in names
+
+
+def test_the_last_stamp_is_that_of_the_newest_sample_of_imus():
+    """The check of the sample rate takes it."""
+    pipeline = Pipeline(parallel(2, detector__name="sequential"))
+    block = stream(pipeline.geometry, 50)
+    ear = Ear(pipeline)
+    for unit, data in messages(block, 2):
+        ear.take(unit, data)
+    behind = block.stamp[-1] - ear.receiver.last_stamp
+    assert abs(behind) < 0.02e9
