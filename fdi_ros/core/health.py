@@ -170,14 +170,17 @@ def usual_limit(settings: PathSettings, i: int) -> float:
 def follow_rail(settings: PathSettings, health: Health, i: int, z: float) -> None:
     """Learn the range of a chip from a repeated extreme value.
 
-    A later larger value shows that the extreme was no end of range.
+    Two larger values in a row show that the extreme was no end of range. A single one
+    may be a spike.
     """
     size = abs(z)
+    before = abs(health.value[i])
     health.repeats[i] = health.repeats[i] + 1 if z == health.value[i] else 1
-    if size > health.extreme[i]:
-        if size > health.extreme[i] + RAIL_SHARE * size + 2.0 * RAIL_OFFSET:
+    if size > health.extreme[i] and before > health.extreme[i]:
+        reached = size if size < before else before
+        if reached > health.extreme[i] + RAIL_SHARE * reached + 2.0 * RAIL_OFFSET:
             health.limit[i] = usual_limit(settings, i)
-        health.extreme[i] = size
+        health.extreme[i] = reached
     if size == health.extreme[i] and health.repeats[i] >= RAIL_REPEATS:
         rail = rail_of(size)
         if rail > 0.0:

@@ -90,3 +90,20 @@ def test_what_was_known_is_kept_while_another_unit_is_away(silent, latch):
     truth_of_others = (values[:, :3] + values[:, 6:]) / 2
     rows = output.valid & since & np.isfinite(truth_of_others).all(axis=1)
     assert np.abs(output.rate - truth_of_others)[rows].max() < 0.05
+
+
+@pytest.mark.parametrize("spike", [0.0, 30.0])
+def test_after_a_spike_the_end_of_a_range_is_still_learned(spike):
+    """The chips of one unit of three end at 250 deg/s."""
+    t = np.arange(3000) / RATE
+    end = np.radians(32767 / 131)
+    truth = [5.0 * np.sin(t), 0.4 * np.cos(0.9 * t), 0.6 * np.sin(0.7 * t)]
+    values = np.tile(np.column_stack(truth), (1, 3))
+    values += np.random.default_rng(5).normal(0, 0.003, values.shape)
+    values[:, 6:] = np.clip(values[:, 6:], -end, end)
+    values[50, 6] += spike
+    pipeline = Pipeline(parallel(3, **SEQUENTIAL))
+    stamps = START + np.arange(len(t)) * round(1e9 / RATE)
+    output = pipeline.process(Block(stamps, values))
+    assert not [event for event in output.events if event.declares]
+    assert (output.state[:, 6] == ChannelState.SUSPECT).any()
