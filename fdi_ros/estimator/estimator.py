@@ -589,15 +589,18 @@ def drop_block(kf: Estimator, n: int) -> None:
     kf.sum_seconds = 0.0
     for i in range(n):
         kf.sum_values[i] = kf.sum_count[i] = kf.sum_time[i] = 0.0
+    kf.shared.rate_count = 0
     for a in range(3):
         kf.sum_rate[a] = kf.spin_sum[a] = 0.0
+        kf.shared.rate_sum[a] = kf.shared.rate_squares[a] = 0.0
 
 
 @compiled
 def forget_motion(kf: Estimator, n: int) -> None:
-    """Begin all anew that is known of the motion."""
+    """Forget the motion: blocks, rest, accelerations and differences of samples."""
     drop_block(kf, n)
     kf.blocks = 0
+    kf.shared.fresh = 0
     kf.rest_count = 0
     kf.rest = False
     kf.unseen = kf.samples > 0

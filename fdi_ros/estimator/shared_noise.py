@@ -344,7 +344,7 @@ def update_vibration(params: Constants, kf: Estimator) -> None:
     for a in range(3):
         noise = shared.alone.inverse[a, a]
         within = 0.0
-        if length > 2.0 and kf.blocks > 0:
+        if length > 2.0 and kf.blocks > 1:
             # About a line through the samples of the block.
             slope = kf.rates[0, a] - kf.rates[1, a]
             about = (
