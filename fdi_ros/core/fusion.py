@@ -14,6 +14,7 @@ from fdi_ros.compiling.compiled import Symmetric, Vector, compiled
 from fdi_ros.core.algebra import along, dot
 from fdi_ros.core.parity import apply_gain, covariance_of, fill_parity
 from fdi_ros.core.records import (
+    ACCELERATION_SAMPLES,
     Acceleration,
     Core,
     Current,
@@ -26,6 +27,18 @@ from fdi_ros.core.records import (
 from fdi_ros.core.repeated import is_at_rest
 from fdi_ros.core.sensors import variance_of
 from fdi_ros.core.subsets import fill_rate
+
+CONTRADICTION = 30.0
+"""Squared residual over its variance from which a channel contradicts the rate. Normal
+noise reaches it in one of 2e7 samples."""
+JUMP = 54.0
+"""Squared second difference of an unchecked channel, in units of its variance, from which
+it is a jump: three standard deviations of independent noise."""
+# Largest error that is added, rad/s: far beyond any gyro, and squared still without
+# rounding errors in the other axes.
+LARGEST_ERROR = 1e3
+# Least share of a channel's variance that counts as the variance of its residual.
+CHECKED_SHARE = 1e-3
 
 
 @compiled
@@ -48,11 +61,14 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
     if last.valid:
         apply_gain(now.gain, n, now.corrected, last.rate)
     update_residuals(settings, now, last)
+    update_course(core)
     update_lag(core)
     if last.valid:
         covariance_of(
             now.gain, n, now.variance, core.sample.estimate.covariance, last.covariance
         )
+        add_alternatives(core, now, last, subsets, doubtful & now.usable)
+        add_jumps(core, now, last, subsets)
         if doubtful & now.usable:
             add_units(settings, now, last, subsets, doubtful & now.usable)
         add_square(last.covariance, now.lagging, 1.0)
@@ -155,6 +171,137 @@ def update_gain(
 
 
 @compiled
+def is_contradicted(
+    settings: PathSettings, now: Current, last: OutputRow, i: int
+) -> bool:
+    """Whether the residual of channel i is beyond what its noise and the rate's explain."""
+    rate_variance = variance_in(last.covariance, settings.sensors.axes[i])
+    if now.fused >> i & 1:
+        # A channel that nothing checks has no residual but rounding.
+        own = now.uncertainty[i]
+        expected = max(own - rate_variance, CHECKED_SHARE * own)
+    else:
+        # The uncertainty of an outlier contains its deviation.
+        expected = now.variance[i] + rate_variance
+    return last.residual[i] * last.residual[i] > CONTRADICTION * expected
+
+
+@compiled
+def update_course(core: Core) -> None:
+    """Extrapolate the last two values of each channel to this sample."""
+    now = core.now
+    history = core.acceleration.history
+    count = core.acceleration.count
+    ratio = math.nan
+    if count >= 3:
+        before = history[(count - 2) % ACCELERATION_SAMPLES].stamp
+        step = before - history[(count - 3) % ACCELERATION_SAMPLES].stamp
+        if step > 0:
+            ratio = (now.evidence.stamp - before) / step
+    for i in range(core.settings.n):
+        change = core.before[i] - core.earlier[i]
+        now.course[i] = core.before[i] + ratio * change
+        core.earlier[i] = core.before[i]
+        core.before[i] = now.corrected[i]
+
+
+@compiled
+def update_leapt(
+    core: Core, now: Current, last: OutputRow, subsets: NDArray[Any], contradicted: int
+) -> None:
+    """Note which channels were left out as they jumped from their course, as a spike does."""
+    for i in range(core.settings.n):
+        if contradicted >> i & 1:
+            jump = now.corrected[i] - now.course[i]
+            residual = last.residual[i]
+            if jump * jump > 0.25 * residual * residual:
+                core.leapt |= 1 << i
+        elif now.usable >> i & 1 and subsets[now.usable & ~(1 << i)].spans:
+            core.leapt &= ~(1 << i)
+
+
+@compiled
+def add_alternatives(
+    core: Core,
+    now: Current,
+    last: OutputRow,
+    subsets: NDArray[Any],
+    doubtful: int,
+) -> None:
+    """Widen the covariance where usable channels contradict the rate or are in doubt.
+
+    Such a channel may be wrong if it is fused. If it is left out, it may be right unless
+    it jumped away, and then a channel is wrong that no other fused channel replaces.
+    Half the squared difference of each such rate from the fused one is added: the error
+    of a mean of two channels, one of which is wrong, is then one standard deviation.
+    """
+    n = core.settings.n
+    contradicted = 0
+    for i in range(n):
+        if now.usable >> i & 1 and is_contradicted(core.settings, now, last, i):
+            contradicted |= 1 << i
+    update_leapt(core, now, last, subsets, contradicted)
+    candidates = contradicted | doubtful
+    wrong = candidates & now.fused
+    right = candidates & ~now.fused & ~core.leapt
+    if wrong | right == 0:
+        return
+    for i in range(n):
+        if wrong >> i & 1:
+            add_alternative(core.settings, now, last, subsets, now.fused & ~(1 << i))
+        if not right >> i & 1:
+            continue
+        for j in range(n):
+            rest = now.fused & ~(1 << j)
+            if now.fused >> j & 1 and not subsets[rest].spans:
+                add_alternative(core.settings, now, last, subsets, rest | 1 << i)
+
+
+@compiled
+def add_alternative(
+    settings: PathSettings,
+    now: Current,
+    last: OutputRow,
+    subsets: NDArray[Any],
+    mask: int,
+) -> None:
+    """Add half the squared difference of the rate of other channels, if they give one."""
+    if not subsets[mask].spans:
+        return
+    fill_rate(subsets[mask], settings.n, mask, now.corrected, now.doubt)
+    for a in range(3):
+        difference = now.doubt[a] - last.rate[a]
+        now.doubt[a] = max(min(difference, LARGEST_ERROR), -LARGEST_ERROR)
+    add_square(last.covariance, now.doubt, 0.5)
+
+
+@compiled
+def add_jumps(core: Core, now: Current, last: OutputRow, subsets: NDArray[Any]) -> None:
+    """Widen the covariance where a value jumps that no other channel checks.
+
+    The jump may be motion or a spike: nothing distinguishes them.
+    """
+    for i in range(core.settings.n):
+        if not now.fused >> i & 1 or subsets[now.usable & ~(1 << i)].spans:
+            continue
+        jump = now.corrected[i] - now.course[i]
+        jump = max(min(jump, LARGEST_ERROR), -LARGEST_ERROR)
+        if jump * jump > JUMP * now.variance[i]:
+            add_square(last.covariance, now.gain[:, i], jump * jump)
+
+
+@compiled
+def variance_in(covariance: Symmetric, axis: Vector) -> float:
+    """Variance along an axis (3,) of a covariance given by its upper triangle (6,)."""
+    x = axis[0]
+    y = axis[1]
+    z = axis[2]
+    squares = x * x * covariance[0] + y * y * covariance[3] + z * z * covariance[5]
+    products = x * y * covariance[1] + x * z * covariance[2] + y * z * covariance[4]
+    return squares + 2.0 * products
+
+
+@compiled
 def add_units(
     settings: PathSettings,
     now: Current,
@@ -214,15 +361,7 @@ def update_common_error(core: Core) -> None:
             common[k] = dot(gain[a], shared[:, c], n)
             k += 1
     for i in range(n):
-        x = axes[i, 0]
-        y = axes[i, 1]
-        z = axes[i, 2]
-        along_axis = (
-            x * x * common[0]
-            + y * y * common[3]
-            + z * z * common[5]
-            + 2.0 * (x * y * common[1] + x * z * common[2] + y * z * common[4])
-        )
+        along_axis = variance_in(common, axes[i])
         mixed = along(axes[i], shared[i])
         core.remaining[i] = math.sqrt(
             max(covariance[i, i] - 2.0 * mixed + along_axis, 0.0)

@@ -642,6 +642,7 @@ class Current:
     others_rate: Vector  # rate by which `update_stuck` measures motion, rad/s
     # sum of squared residuals of the other channels, for each channel, (rad/s)^2
     disagreement: Channels
+    course: Channels  # that the last two values of each lead to, rad/s, or NaN
     doubt: Vector  # an error of the rate whose square is added to its covariance, rad/s
     shared_error: Axes  # C G', covariance of channel errors with the rate, (rad/s)^2
     moved: Channels  # change of each channel since another one repeats its value, rad/s
@@ -684,6 +685,9 @@ class Core:
     witnesses: Counts
     # values of all channels at that time, rad/s
     reference_input: Square
+    before: Channels  # corrected values of the last sample, rad/s
+    earlier: Channels  # and of the one before it
+    leapt: Mask  # left out of the rate since a jump away from it
     saturated: Flag  # a manoeuvre has driven a channel out of range
     saturated_stamp: Whole  # last sample with a saturated channel, ns
     samples: Whole  # so far

@@ -168,3 +168,71 @@ def test_while_two_units_disagree_one_alone_is_not_believed(late):
             # imu_1 has returned before the alarm, and imu_2.x is the one that jumped.
             assert error[onset + 2] < 0.05
             assert std[onset + 2] < 0.05
+
+
+def spike_beside_an_offset(z, late):
+    z[late, 4] += 1.0
+    z[np.argmax(late) + 3, 2] += 30.0
+
+
+def spike_as_vibration_begins(z, late):
+    seconds = np.arange(len(z)) / RATE
+    vibration = late * np.sin(2 * np.pi * 23.0 * seconds)
+    z += np.outer(vibration, np.tile([0.1, -0.1, 0.1], 2))
+    z[np.argmax(late) + 110, 4] += 5.0
+    return np.outer(vibration, [0.1, -0.1, 0.1])
+
+
+def stuck(z, late):
+    z[late, 0] = z[np.argmax(late), 0]
+
+
+def spikes_of_the_last_channel(z, late):
+    z[late, 1] = np.nan
+    z[np.argmax(late) + 300 :: 50, 4] += 5.0
+
+
+@pytest.mark.parametrize(
+    ("disturb", "usual"),
+    [
+        (spike_beside_an_offset, 0.01),
+        (spike_as_vibration_begins, 0.05),
+        (stuck, 0.01),
+        (spikes_of_the_last_channel, 0.01),
+    ],
+)
+def test_channels_that_contradict_the_rate_are_in_its_covariance(disturb, usual):
+    """Two units, which cannot tell who is wrong. The median std stays below ``usual``, rad/s."""
+    time = np.arange(round(12.0 * RATE)) / RATE
+    pipeline = Pipeline(parallel(2, detector__name="sequential"))
+    for seed in range(4):
+        motion = swung(time) * np.clip(time - 2.0, 0.0, 1.0)[:, None]
+        z = np.hstack([motion, motion])
+        z += np.random.default_rng(seed).normal(0.0, SIGMA, z.shape)
+        common = disturb(z, time >= 6.0 + 0.4 * seed)
+        truth = motion if common is None else motion + common
+        pipeline.restart()
+        output = pipeline.process(Block(START + np.round(1e9 * time).astype(int), z))
+        error = output.rate - truth
+        inverse = np.linalg.inv(output.covariance)
+        square = np.einsum("ki,kij,kj->k", error, inverse, error)
+        assert np.nanmax(square) < 60.0
+        assert np.nanmedian(np.sqrt(output.covariance[:, 2, 2])) < usual
+
+
+@pytest.mark.parametrize("offset", range(4))
+def test_a_hole_in_a_turn_leaves_the_covariance_as_it_was(offset):
+    """A turn of 8 rad/s about z; the hole begins at each place of a block of four samples."""
+    time = np.arange(round(5.0 * RATE)) / RATE
+    turn = 8.0 + 0.5 * np.sin(0.5 * time)
+    motion = np.column_stack([0.0 * time, 0.0 * time, turn])
+    z = np.hstack([motion] * 3)
+    z += np.random.default_rng(5).normal(0.0, SIGMA, z.shape)
+    seen = (time < 4.0 + offset / RATE - 1e-6) | (time > 4.12 + offset / RATE)
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    stamp = START + np.round(1e9 * time).astype(np.int64)
+    output = pipeline.process(Block(stamp[seen], z[seen]))
+    std = np.sqrt(output.covariance[:, 2, 2])
+    before = np.median(std[300:400])
+    assert std[-80:].max() < 1.3 * before
+    assert std[-80:].min() > 0.7 * before
