@@ -36,7 +36,7 @@ JUMP = 54.0
 it is a jump: three standard deviations of independent noise."""
 # Largest error that is added, rad/s: far beyond any gyro, and squared still without
 # rounding errors in the other axes.
-LARGEST_ERROR = 1e3
+LARGEST_DIFFERENCE = 1e3
 # Least share of a channel's variance that counts as the variance of its residual.
 CHECKED_SHARE = 1e-3
 
@@ -271,7 +271,7 @@ def add_alternative(
     fill_rate(subsets[mask], settings.n, mask, now.corrected, now.doubt)
     for a in range(3):
         difference = now.doubt[a] - last.rate[a]
-        now.doubt[a] = max(min(difference, LARGEST_ERROR), -LARGEST_ERROR)
+        now.doubt[a] = max(min(difference, LARGEST_DIFFERENCE), -LARGEST_DIFFERENCE)
     add_square(last.covariance, now.doubt, 0.5)
 
 
@@ -285,7 +285,7 @@ def add_jumps(core: Core, now: Current, last: OutputRow, subsets: NDArray[Any]) 
         if not now.fused >> i & 1 or subsets[now.usable & ~(1 << i)].spans:
             continue
         jump = now.corrected[i] - now.course[i]
-        jump = max(min(jump, LARGEST_ERROR), -LARGEST_ERROR)
+        jump = max(min(jump, LARGEST_DIFFERENCE), -LARGEST_DIFFERENCE)
         if jump * jump > JUMP * now.variance[i]:
             add_square(last.covariance, now.gain[:, i], jump * jump)
 

@@ -17,9 +17,9 @@ from fdi_ros.mavlink.protocol import MS, NS
 
 #: After this time no answer to a read is under way, ns: longer than the longest round
 #: trip at which failover is ready, and the 100 ms by which ArduPilot answers late.
-QUIET = 500 * MS
+PROBE_QUIET = 500 * MS
 ANSWERED = NS  #: The answer to a probe is awaited for this time, ns.
-AGAIN = 5 * NS  #: Time between two probes of an IMU that brought no answer, ns.
+PROBE_AGAIN = 5 * NS  #: Time between two probes of an IMU that brought no answer, ns.
 
 
 class Probe(NamedTuple):
@@ -67,9 +67,9 @@ def probe(
             obeys[imu] = True
         is_over = state.sent and now - state.sent >= ANSWERED
         if is_over or not may[imu] or obeys[imu] is not None:
-            after[imu] = now + AGAIN
+            after[imu] = now + PROBE_AGAIN
             imu = -1
-        elif not state.sent and now - state.begun >= QUIET:
+        elif not state.sent and now - state.begun >= PROBE_QUIET:
             return state._replace(obeys=tuple(obeys), sent=now), imu
     if imu >= 0:
         return state._replace(obeys=tuple(obeys)), -1

@@ -27,7 +27,7 @@ INS_USE = ("INS_USE", "INS_USE2", "INS_USE3")
 EKF_LANES = "EK3_IMU_MASK"
 LARGEST_AGE = 1.0  #: Age of the newest judged sample from which the monitor is late, s.
 LARGEST_LOSS = 0.1  #: Largest share of lost messages.
-LONGEST_TRIP = 300 * MS  #: Longest round trip, ns.
+LARGEST_READY_TRIP = 300 * MS  #: Longest round trip, ns.
 MONITOR_LATE = "the monitor is late"
 #: By whether the autopilot sets a parameter, as far as is known.
 ORDER_WORDS = {
@@ -60,7 +60,7 @@ def doubt(view: View, facts: Facts) -> str:
         (not abs(facts.age) <= LARGEST_AGE, MONITOR_LATE),
         (facts.lost > LARGEST_LOSS, "link loses messages"),
         (facts.is_slow, "IMUs come too slowly"),
-        (trip is None or trip > LONGEST_TRIP, "link is slow"),
+        (trip is None or trip > LARGEST_READY_TRIP, "link is slow"),
         (not view.linked, "no ArduPilot that sends each IMU"),
         (not view.monitored, "the monitor is in doubt"),
     )

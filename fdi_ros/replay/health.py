@@ -37,7 +37,7 @@ LEAST_SLOW = 3
 
 NOISE_WINDOW = 3.0
 """Duration of a window in which noise is measured, s: some swings of a loose mount."""
-LEAST_WINDOWS = 3
+LEAST_USUAL_WINDOWS = 3
 """Smallest number of windows for a noise: fewer are dominated by the start-up."""
 
 
@@ -207,6 +207,6 @@ class UsualNoise:
         usual: Array = np.full(len(self._axes), np.nan)
         if self._noise:
             windows = np.array(self._noise)
-            measured = np.isfinite(windows).sum(axis=0) >= LEAST_WINDOWS
+            measured = np.isfinite(windows).sum(axis=0) >= LEAST_USUAL_WINDOWS
             usual[measured] = np.nanmedian(windows[:, measured], axis=0)
         return usual

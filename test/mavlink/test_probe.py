@@ -6,7 +6,13 @@
 from collections.abc import Sequence
 from itertools import pairwise
 
-from fdi_ros.mavlink.failover_probe import AGAIN, ANSWERED, QUIET, Probe, probe
+from fdi_ros.mavlink.failover_probe import (
+    ANSWERED,
+    PROBE_AGAIN,
+    PROBE_QUIET,
+    Probe,
+    probe,
+)
 
 MS = 1_000_000
 NS = 1000 * MS
@@ -34,7 +40,10 @@ class Probed:
                     self.heard[k] = self.now
             for k in range(3):
                 # An answer to a read sent before the parameter became quiet.
-                if k != self.state.imu or self.now < self.state.begun + QUIET - TICK:
+                if (
+                    k != self.state.imu
+                    or self.now < self.state.begun + PROBE_QUIET - TICK
+                ):
                     self.heard[k] = self.now
             self.state, imu = probe(
                 self.state, self.may, self.heard, self.outcomes, self.now
@@ -55,8 +64,8 @@ def test_one_that_is_not_answered_stays_unknown_and_is_tried_again() -> None:
     talk.answers[1] = False
     assert talk.run(20.0) == (True, None, True)
     times = [at for imu, at in talk.set_at if imu == 1]
-    assert 2 <= len(times) <= 20 * NS // AGAIN
-    assert min(b - a for a, b in pairwise(times)) >= AGAIN + ANSWERED
+    assert 2 <= len(times) <= 20 * NS // PROBE_AGAIN
+    assert min(b - a for a, b in pairwise(times)) >= PROBE_AGAIN + ANSWERED
 
 
 def test_while_an_order_may_follow_nothing_is_set() -> None:
