@@ -123,7 +123,6 @@ class Failover:
         self._lost = math.nan  # share of messages lost of late
         self._ready: tuple[str, int] = ("", 0)  # the present reason, and since when
         self._told: str | None = None  # the reason announced last
-        self._doubted = False  # announced while an IMU is out of use
 
     @property
     def out(self) -> tuple[int, ...]:
@@ -227,16 +226,33 @@ class Failover:
     def status(self, now: int) -> tuple[Level, str]:
         """Return level and words for the diagnostics."""
         if self.out:
-            names = ", ".join(imu_name(imu, self._channels) for imu in self.out)
+            words = self._out_words()
             is_saved = self._file.written.out == self.out
             unsaved = "" if is_saved else "; failover_file is not written"
-            words = f"out of use: {names} of system {self._system}{unsaved}"
             ending = "; reboot before flight" if self._without_notch else ""
-            if not self._is_same:
+            if self._vehicle.system is None:
+                ending = "; no autopilot is heard yet"
+            elif not self._is_same:
                 ending = f"; no failover of system {self._vehicle.system}"
-            return Level.WARN, words + ending
+            return Level.WARN, words + unsaved + ending
         why = self._not_ready(self._view(now), now)
         return (Level.WARN, f"no failover: {why}") if why else (Level.OK, "ready")
+
+    def _out_words(self) -> str:
+        """Return which IMUs are out of use, and which were ordered out without effect."""
+        memories = self._state.memories
+        out: list[str] = []
+        asked: list[str] = []
+        for k in self.out:
+            still_used = memories[k].seen is True and memories[k].held
+            place = asked if still_used else out
+            place.append(imu_name(k, self._channels))
+        parts = []
+        if out:
+            parts.append(f"out of use: {', '.join(out)} of system {self._system}")
+        if asked:
+            parts.append(f"ordered out, reported in use: {', '.join(asked)}")
+        return "; ".join(parts)
 
     def _note_boot(self, now: int) -> None:
         """Note a start of the autopilot: its clock has gone back, or is behind for long."""
@@ -383,11 +399,10 @@ class Failover:
             now - self._ready[1] < ANNOUNCED_AFTER and not is_late
         ):
             return
-        if self.out and not why and not self._doubted:
+        if self.out and not why and not self._told:
             return
         if why != self._told and (view.armed or not why):
             self._told = why
-            self._doubted = bool(self.out and why)
             fine = "failover acts again" if self.out else "failover is ready"
             words = f"no failover: {why}" if why else fine
             self._say(WARNING if why else INFO, f"FDI: {words}"[:TEXT_LENGTH])

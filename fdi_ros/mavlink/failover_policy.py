@@ -285,7 +285,7 @@ def objection(
     checks = (
         (view.linked, "no ArduPilot that sends each IMU"),
         (view.armed, "not armed"),
-        (view.monitored, "the monitor is in doubt"),
+        (view.monitored, "monitor silent or not alone"),
         (is_bad(view.imus[k], settings), "not bad"),
         (view.imus[k].use, "not reported in use"),
         (not memories[k].left_alone, "set by others"),
@@ -362,12 +362,12 @@ def _remember(
     """Update a memory from the present view, before any decision."""
     if view.restore and memory.ours:
         memory.left_alone = True
+    if imu.use is not None:
+        _hear(memory, imu.use, imu.heard)
     if view.disarmed >= GROUNDED:
         memory.left_alone = False
         memory.taken = 0
         memory.lane_angle = 0.0
-    if imu.use is not None:
-        _hear(memory, imu.use, imu.heard)
     if imu.agreed is not None and now - imu.agreed >= ACQUAINTED:
         memory.acquainted = True
     is_danger = view.armed and is_bad(imu, settings)
@@ -577,7 +577,8 @@ def _condition(
         (is_out and not view.armed and memory.without_notch, Condition.REBOOT),
         (is_out and not view.armed and imu.named is True, Condition.STAYS_OUT),
         (is_out and not view.armed and not imu.ok, Condition.NOT_OK),
-        (is_out and not view.armed and memory.held, Condition.UNTURNED),
+        # Until it is reported in use, also once it has been ordered back.
+        (is_out and not view.armed, Condition.UNTURNED),
         (is_out, Condition.OUT),
         (memory.left_alone, Condition.LEFT_ALONE),
         (memory.seen is False, Condition.UNUSED),

@@ -62,7 +62,7 @@ def doubt(view: View, facts: Facts) -> str:
         (facts.is_slow, "IMUs come too slowly"),
         (trip is None or trip > LARGEST_READY_TRIP, "link is slow"),
         (not view.linked, "no ArduPilot that sends each IMU"),
-        (not view.monitored, "the monitor is in doubt"),
+        (not view.monitored, "monitor silent or not alone"),
     )
     return next((words for holds, words in checks if holds), "")
 

@@ -52,9 +52,10 @@ class Gentle:
     units: int
     noise: float
     random: np.random.Generator
+    size: float = 1.0
 
     def __call__(self, t: float) -> np.ndarray:
-        omega = np.array(
+        omega = self.size * np.array(
             [0.5 * math.sin(0.8 * t), 0.4 * math.cos(1.1 * t), 0.3 * math.sin(0.5 * t)]
         )
         return omega + self.random.normal(0.0, self.noise, (self.units, 3))

@@ -34,6 +34,7 @@ from mavlink.autopilots import (
     UTC,
     Autopilot,
     Conversation,
+    Gentle,
     Motion,
     gentle,
 )
@@ -78,6 +79,8 @@ class Monitored(Conversation):
         #: Clocks of the companion. None: Unix time alone.
         self.clocks: Callable[[], Clocks] | None = None
         self.states = [OK] * 9
+        #: Simulated seconds pass in milliseconds, too short for a real disk.
+        self.waits_for_disk = True
         self.failover.is_alone = self.reports = True
         self.failover.age = 0.02
         self._fed = 0
@@ -107,6 +110,8 @@ class Monitored(Conversation):
                 self.failover.reported = self.now
             self.failover.evidence.hear(self.states, self.now)
             self.failover.turn(self.now)
+            if self.waits_for_disk:
+                self.failover._file._wait()
         return self
 
     def fault(
@@ -712,6 +717,7 @@ def test_a_slow_disk_holds_up_no_order(
         return whole(path)
 
     monkeypatch.setattr(failover_file, "replacing", slow)
+    flying.waits_for_disk = False
     flying.fault(1, 0.5, seconds=1.0)
     assert flying.in_use == [False, True, True]
     assert flying.failover.status(flying.now)[1].endswith(
@@ -878,8 +884,50 @@ def test_after_landing_an_imu_stays_out_until_it_has_agreed_while_turning(
     flying.run(5.0)
     assert flying.in_use == [True, False, True], "turned, and it does not agree"
     scale = 1.0
-    flying.run(5.0)
+    said = len(flying.texts)
+    flying.run(8.0)
     assert flying.in_use == [True] * 3
+    assert flying.texts[said:] == ["IMU 2 in use, differs no more"]
+
+
+def test_a_doubt_from_before_an_imu_is_out_ends_in_words(flying: Monitored) -> None:
+    flying.reports = False
+    flying.run(9.0)
+    assert flying.texts[-1] == "no failover: monitor silent or not alone"
+    flying.reports = True
+    flying.fault(3, 0.6, seconds=6.0)
+    assert flying.in_use == [True, True, False]
+    assert flying.texts[-1] == "failover acts again"
+
+
+def test_an_order_without_effect_is_not_shown_as_out_of_use(flying: Monitored) -> None:
+    flying.autopilots[0].read_only.update(PARAMETERS)
+    flying.fault(2, 0.3, seconds=4.0)
+    assert reason(flying) == "ordered out, reported in use: IMU 2"
+    flying.autopilots[0].read_only.clear()
+    assert reason(flying.run(4.0)).startswith("out of use: IMU 2 of system 1")
+
+
+@pytest.mark.parametrize("by_station", [False, True])
+def test_what_goes_back_on_the_ground_is_not_announced_as_out(
+    flying: Monitored, by_station: bool
+) -> None:
+    autopilot = flying.autopilots[0]
+    turning = autopilot.motion
+    flying.fault(2, 0.3, seconds=4.0)
+    autopilot.armed = False
+    autopilot.motion = Gentle(3, 0.002, np.random.default_rng(3), size=0.0)
+    flying.fault(2, 0.0, (OK, FAULTY, OK), seconds=5.0)
+    flying.heal(2, 5.0)
+    said = len(flying.texts)
+    if by_station:
+        autopilot.parameters["INS_USE2"] = 1.0
+    else:
+        autopilot.motion = turning
+    flying.run(8.0)
+    assert flying.in_use == [True] * 3
+    wrong = ("IMU 2 out of use", "IMU 2 left alone")
+    assert not [text for text in flying.texts[said:] if text.startswith(wrong)]
 
 
 def started_anew(flying: Monitored, path: Path) -> Monitored:
@@ -1028,7 +1076,7 @@ def test_a_late_or_silent_monitor_and_a_poor_link_are_not_ready(
     assert flying.texts[-1] == "no failover: the monitor is late"
     flying.failover.age = 0.02
     flying.reports = False
-    assert reason(flying.run(6.0)) == "no failover: the monitor is in doubt"
+    assert reason(flying.run(6.0)) == "no failover: monitor silent or not alone"
     flying.reports = True
     flying.autopilots[0].loss = 0.3
     assert reason(flying.run(12.0)) == "no failover: link loses messages"
@@ -1214,7 +1262,9 @@ def test_a_disk_that_never_answers_holds_up_neither_start_nor_end(
 
     monkeypatch.setattr(failover_file, "replacing", never)
     monkeypatch.setattr(failover_file, "LONGEST_END", 0.01)
-    talk = Monitored(tmp_path, Autopilot("ardupilot")).run(12.0)
+    talk = Monitored(tmp_path, Autopilot("ardupilot"))
+    talk.waits_for_disk = False
+    talk.run(12.0)
     assert reason(talk) == "no failover: failover_file is not usable"
     words = "is not saved: the disk does not answer"
     assert sum(words in event for event in talk.vehicle.events) == 1
@@ -1231,6 +1281,7 @@ def test_a_disk_that_never_answers_holds_up_neither_start_nor_end(
 def test_a_file_that_cannot_be_written_in_flight_is_announced_and_written_later(
     flying: Monitored, tmp_path: Path
 ) -> None:
+    flying.run(0.02)
     for file in tmp_path.iterdir():
         file.unlink()
     tmp_path.rmdir()

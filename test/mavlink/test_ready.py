@@ -56,7 +56,7 @@ def test_all_good_is_ready_and_two_imus_are_not() -> None:
             "the autopilot refuses INS_USE2",
         ),
         ({"linked": False}, "no ArduPilot that sends each IMU"),
-        ({"monitored": False}, "the monitor is in doubt"),
+        ({"monitored": False}, "monitor silent or not alone"),
         ({"second": {"use": None}}, "use of IMU 2 is not reported"),
         ({"second": {"use": False}}, "IMU 2 not in use"),
         ({"second": {"agreed": None}}, "IMU 2 agrees with none"),
