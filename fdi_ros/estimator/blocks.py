@@ -60,7 +60,7 @@ def fused_variance(params: Constants, kf: Estimator, variance: Array) -> float:
 
 @compiled
 def update_acceleration(params: Constants, kf: Estimator) -> float:
-    """Angular acceleration in the middle of the block before, into ``kf.acceleration``; return its variance by noise.
+    """Angular acceleration in the middle of the block before, into ``kf.acceleration``. Return its variance by noise.
 
     It is the difference of block means. Where the rates at the ends of the block
     contradict that difference, as under vibration faster than a block, ``kf.shaken``
@@ -143,7 +143,7 @@ def update_extra_variance(params: Constants, kf: Estimator, i: int) -> None:
 
 @compiled
 def judge_block(params: Constants, kf: Estimator) -> float:
-    """Work out the innovations A (y - C x) of the block before; return the block's weight: 1, or less if improbable."""
+    """Work out the innovations A (y - C x) of the block before. Return the block's weight: 1, or less if improbable."""
     n = params.sensors.n
     noise = kf.noise
     layout = params.layout
@@ -227,7 +227,7 @@ def unlearnable(error: float, inside: float, signal_square: float) -> float:
 def mean_variance(params: Constants, kf: Estimator, i: int, unknown: float) -> float:
     """Noise variance of a block's mean of channel i, (rad/s)^2.
 
-    ``unknown`` is the factor for slow noise that was not measured yet; 1 leaves it out.
+    ``unknown`` is the factor for slow noise that was not measured yet. 1 leaves it out.
     """
     noise = kf.noise
     return noise.now.block[i] * noise.longest[i] * unknown / params.length
@@ -318,7 +318,7 @@ def keep_delay_variance(
 
 @compiled
 def update_least_variances(params: Constants, kf: Estimator) -> None:
-    """Find the variance that each state of the motion keeps at least; biases keep none."""
+    """Find the variance that each state of the motion keeps at least. Biases keep none."""
     for r in range(params.layout.count):
         kf.least_variance[r] = 0.0
     if kf.rest:

@@ -41,7 +41,7 @@ def update_time_offsets(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def transfer_delays(params: Constants, kf: Estimator) -> bool:
-    """Move sure delays from their states to ``late``, which `restamp` compensates; return whether any moved."""
+    """Move sure delays from their states to ``late``, which `restamp` compensates. Return whether any moved."""
     changed = False
     for u in range(1, params.units):
         place = params.layout.delays[u]

@@ -28,7 +28,7 @@ their ends: filters and sampling instants are not the same."""
 
 @compiled
 def follow_displacement(params: Constants, kf: Estimator, sample: SampleInput) -> None:
-    """Follow the variance by unknown positions, and the turn of the body; a turn that begins counts at once."""
+    """Follow the variance by unknown positions, and the turn of the body. A turn that begins counts at once."""
     n = params.sensors.n
     lasting = 2.0 * params.length
     begins = False

@@ -43,7 +43,9 @@ class StateKind(NamedTuple):
 
     name: str
     unit: str
-    per_unit: bool  # one for each unit but the first, the reference; False: one for each channel
+    per_unit: (
+        bool  # one for each unit but the first, the reference, or one for each channel
+    )
     by: tuple[int, ...]
     """Multiplier of each state; empty: a single state, the rate of change of `feeds`."""
     # standard deviation before anything is shown, where `prepare_layout` is given no
@@ -96,7 +98,7 @@ class Layout:
     place: Entries  # state of each signal of a channel, or -1
     prior: States  # standard deviation, in the unit of each
     walk: States  # per sqrt(s)
-    memory: States  # time constant, s; 0: infinite
+    memory: States  # time constant, s, or 0 if infinite
     feeds: Places  # state of which this one is the rate of change, or -1
     delays: Annotated[
         NDArray[np.int64], "i8", (MAX_UNITS,)
@@ -315,7 +317,7 @@ def update(
     weight
         Of the measurement, 0 to 1.
     least
-        Least variance of each state (states,); 0: no bound.
+        Least variance of each state (states,), 0 without a bound.
     """
     count = layout.count
     share = at.share
@@ -376,7 +378,7 @@ def variance_gained(
 def keep_least_variance(
     layout: Layout, i: int, by: int, variance: float, least: Array
 ) -> None:
-    """Bound the variance of the states of channel i with multiplier ``by``; a unit takes its best axis."""
+    """Bound the variance of the states of channel i with multiplier ``by``. A unit takes its best axis."""
     for k in range(SIGNALS):
         place = layout.place[i, k]
         if layout.by[k] == by and place >= 0:

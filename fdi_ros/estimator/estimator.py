@@ -97,7 +97,7 @@ SLOW_TURN = 1e-4
 
 @record
 class Constants:
-    """Constants of the estimator and of the detector that tests its innovations; filled by the detector."""
+    """Constants of the estimator and of the detector that tests its innovations. The detector fills them."""
 
     sensors: Sensors
     layout: Layout
@@ -114,7 +114,7 @@ class Constants:
     # standard deviation of errors not linear in the rate, share of the rate along each
     nonlinearity: Channels
     rest_std: Real  # of the rate at rest, rad/s
-    # of a bias, standard deviation, (rad/s)/(m/s^2); 0: none
+    # of a bias, standard deviation, (rad/s)/(m/s^2), or 0
     g_sensitivity: Real
     bias_move: Real  # of a healthy bias in flight, standard deviation, rad/s
     largest_move: Real  # of all healthy biases together within half a minute, rad/s
@@ -144,7 +144,7 @@ class Total:
 class Snapshot:
     """The states at a moment."""
 
-    seconds: Real  # since the start; negative: no snapshot
+    seconds: Real  # since the start, or negative without a snapshot
     states: ErrorStates
     late: Units  # delays that `restamp` made up for then, s
     force: Vector  # specific force that the biases belong to, m/s^2
@@ -175,7 +175,7 @@ class Estimator:
     spiked: Mask  # of these, those of a spike; all, if the culprit is not known
     spikes: Counts  # of each channel so far
     # square of the last deviation of a channel from the others, (rad/s)^2, until they
-    # agree again or one is declared; 0: no deviation beyond noise
+    # agree again or one is declared, or 0
     doubt: Channels
     judged_at: Real  # time of the last sample with redundancy, s since the start
     clean: Parity  # without the outliers
@@ -202,11 +202,11 @@ class Estimator:
     expected_parity: Parity  # of a sample in the noise expected
     fused: Parity  # of a sample, without the channels left aside
     at: Projection  # of a sample
-    least_variance: States  # of each state; 0: no bound
+    least_variance: States  # of each state, or 0 without a bound
     usual_rate: Vector  # mean square of the rate of the last second, (rad/s)^2
     shared: SharedNoise
     zero: Vector  # in place of a rate that is not known yet
-    signal_rate: Vector  # rate that multiplies the states, rad/s; zero at rest
+    signal_rate: Vector  # rate that multiplies the states, rad/s, zero at rest
     # Of the block being filled, and the last ones:
     filled: Whole
     far_samples: Whole  # samples in a row that are far off
@@ -241,7 +241,7 @@ class Estimator:
     block_noise: Channels  # variance of the mean of a block by noise, (rad/s)^2
     block_innovation: Channels  # rad/s
     block_values: Channels  # A y, s/rad
-    angular_acceleration: Channels  # along each channel, rad/s^2; zero where only noise
+    angular_acceleration: Channels  # along each channel, rad/s^2, zero where only noise
     # Of the last second of blocks of each channel, against the others: mean deviation,
     # rad/s; its mean square about that mean, (rad/s)^2; its mean product with the angular
     # acceleration, rad^2/s^3; and the mean square of that acceleration, (rad/s^2)^2.
@@ -347,7 +347,7 @@ def update_weights(params: Constants, kf: Estimator) -> None:
 def correct_sample(
     params: Constants, kf: Estimator, values: Array, gain: Array
 ) -> None:
-    """Correct a sample (n,) by the present states; update its rate, by a gain (3, n), and its innovations."""
+    """Correct a sample (n,) by the present states. Update its rate, by a gain (3, n), and its innovations."""
     n = params.sensors.n
     layout = params.layout
     signals = kf.at.signals
@@ -458,7 +458,7 @@ def copy_total(n: int, source: Total, target: Total) -> None:
 
 @compiled
 def follow_gaps(params: Constants, kf: Estimator) -> None:
-    """Note when channels return from a gap; a unit that is slower than the others has none."""
+    """Note when channels return from a gap. A unit that is slower than the others has none."""
     for i in range(params.sensors.n):
         if kf.mask >> i & 1:
             before = kf.present_at[i]
@@ -492,7 +492,7 @@ def add_to_total(kf: Estimator, i: int, value: float) -> None:
 
 @compiled
 def add_sample(params: Constants, kf: Estimator, values: Array, seconds: float) -> bool:
-    """Add a sample to the totals and, unless a spike, to the block; return whether the block is complete."""
+    """Add a sample to the totals and, unless a spike, to the block. Return whether the block is complete."""
     n = params.sensors.n
     total = kf.total
     total.sample = kf.samples

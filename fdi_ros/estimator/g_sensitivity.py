@@ -62,7 +62,7 @@ def follow_force(params: Constants, kf: Estimator, sample: SampleInput) -> None:
 
 @compiled
 def change_of_force(kf: Estimator) -> float:
-    """Return the distance of the specific force from the reference, m/s^2; 0 if it does not count."""
+    """Return the distance of the specific force from the reference, m/s^2. It is 0 if it does not count."""
     square = 0.0
     for a in range(3):
         step = kf.force[a] - kf.reference_force[a]
@@ -89,7 +89,7 @@ def count_growth(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def renew_reference(params: Constants, kf: Estimator, may_recall: bool) -> bool:
-    """Fade the variance after a block; make a specific force that lasts the reference of the biases.
+    """Fade the variance after a block. Make a specific force that lasts the reference of the biases.
 
     Return whether the biases are those of a snapshot from that force.
     """

@@ -191,7 +191,7 @@ class SharedNoise:
 
 @compiled
 def begin_noise(noise: Noise, n: int, expected: Array) -> None:
-    """Begin with the variances expected (n,), (rad/s)^2; ``noise`` is all zero."""
+    """Begin with the variances expected (n,), (rad/s)^2. ``noise`` is all zero."""
     noise.regime = MOTION
     for i in range(n):
         for levels in (noise.now, noise.kept[0], noise.kept[1]):
@@ -219,7 +219,7 @@ def update_longest(noise: Noise, n: int) -> None:
 
 @compiled
 def change_regime(noise: Noise, n: int, regime: int, at_least: bool) -> None:
-    """Switch to the noise learned at rest or in motion; ``at_least``: keep the larger of both, as motion begins."""
+    """Switch to the noise learned at rest or in motion. ``at_least``: keep the larger of both, as motion begins."""
     before = noise.kept[noise.regime]
     after = noise.kept[regime]
     for i in range(n):
@@ -242,7 +242,7 @@ def change_regime(noise: Noise, n: int, regime: int, at_least: bool) -> None:
 
 @compiled
 def place_of(noise: Noise, mask: int) -> int:
-    """Find the place of the last statistics of the same channel set; ``noise.repeats``: the set is known."""
+    """Find the place of the last statistics of the same channel set. ``noise.repeats``: the set is known."""
     noise.repeats = True
     for k in range(2):
         if noise.sets[k] == mask:
@@ -258,7 +258,7 @@ def place_of(noise: Noise, mask: int) -> int:
 def update_sample_noise(
     noise: Noise, n: int, mask: int, t: Array, inflation: Array, learn: bool, slot: int
 ) -> None:
-    """Take the statistics t (n,) of a sample; inflation: total variance over the noise alone."""
+    """Take the statistics t (n,) of a sample. Inflation: total variance over the noise alone."""
     gain = 1.0 / min(noise.seen[SAMPLE] + TAIL_FIRST, TAIL_MEMORY)
     # With another channel set the rate estimate changes, and the difference would show
     # sensor errors, not noise.
@@ -398,7 +398,7 @@ def update_degrees(noise: Noise, n: int, mask: int) -> None:
 def update_block_noise(
     noise: Noise, n: int, mask: int, t: Array, expected: Array, learn: bool
 ) -> None:
-    """Take the statistics t (n,) of a block; expected: (n,) (rad/s)^2."""
+    """Take the statistics t (n,) of a block. Expected: (n,) (rad/s)^2."""
     gain = 1.0 / min(noise.seen[BLOCK] + 25.0, 100.0)
     for i in range(n):
         if mask >> i & 1:

@@ -5,7 +5,7 @@
 
 The first hypothesis that leaves only noise explains an outlier: one channel, then one unit.
 Parity cannot distinguish some hypotheses, as with two parallel units. Then the one that
-changes the rate least since the last sample is taken, if by far; otherwise all their
+changes the rate least since the last sample is taken, if by far. Otherwise all their
 channels are excluded. A spike is counted and kept out of the estimated rate, the blocks and
 the learned vibration. The evidence for faults uses all values unchanged.
 """
@@ -78,7 +78,7 @@ def find_outliers(params: Constants, kf: Estimator, values: Array) -> None:
 
 @compiled
 def stays_in_doubt(params: Constants, kf: Estimator) -> bool:
-    """Update the doubt about each channel; return whether a sample in doubt is not checked at all.
+    """Update the doubt about each channel. Return whether a sample in doubt is not checked at all.
 
     All channels that disagree with a fault may be missing between its first samples.
     """
@@ -158,7 +158,7 @@ def fill_sample_covariance(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def chi_without(params: Constants, kf: Estimator, without: int) -> float:
-    """Return the chi-square of the sample without some channels; ``kf.clean_rate`` gets the rate of the others."""
+    """Return the chi-square of the sample without some channels. ``kf.clean_rate`` gets the rate of the others."""
     n = params.sensors.n
     parity = kf.clean
     mask = kf.mask & ~without
@@ -204,7 +204,7 @@ def change_without(
 def choose(
     params: Constants, kf: Estimator, candidates: int, burst: float, limit: float
 ) -> int:
-    """Return the channel, or the channels of the unit, that explains the sample; 0: none does.
+    """Return the channel, or the channels of the unit, that explains the sample, or 0.
 
     A channel is preferred. A unit is chosen where the unit changes the rate far less,
     because some spikes of a unit look like a spike of one channel of another unit. If
@@ -238,7 +238,7 @@ def choose(
 
 @compiled
 def decides(kf: Estimator, least: float, second: float) -> bool:
-    """Whether the least change of the rate is smaller by far; after a hole no rate is known."""
+    """Whether the least change of the rate is smaller by far. After a hole no rate is known."""
     return second == math.inf or (kf.blocks > 0 and least < CLOSER * second)
 
 

@@ -182,7 +182,7 @@ def update_shape(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def update_shared_level(params: Constants, kf: Estimator) -> None:
-    """Find the variance of each channel now, with noise that independent channels do not explain; once a block."""
+    """Find the variance of each channel now, once a block, with noise that independent channels do not explain."""
     shared = kf.shared
     n = params.sensors.n
     noise = kf.noise
@@ -245,7 +245,7 @@ def update_line(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def update_dimensions(params: Constants, kf: Estimator, k: float) -> float:
-    """Find the level of R over the variances; return the share of R that is a line, by its dimensions."""
+    """Find the level of R over the variances. Return the share of R that is a line, by its dimensions."""
     shared = kf.shared
     n = params.sensors.n
     first = 0.0
@@ -269,7 +269,7 @@ def update_dimensions(params: Constants, kf: Estimator, k: float) -> float:
 
 @compiled
 def update_coherence(params: Constants, kf: Estimator) -> float:
-    """Average the products of a block, correct each variance by them; return the coherent share."""
+    """Average the products of a block, correct each variance by them. Return the coherent share."""
     shared = kf.shared
     n = params.sensors.n
     noise = kf.noise
@@ -310,7 +310,7 @@ def update_coherence(params: Constants, kf: Estimator) -> float:
 
 @compiled
 def update_common(shared: SharedNoise, adaptation_gain: float, count: int) -> float:
-    """Update Q by the common rate and invert Q; return the energy of Q over noise."""
+    """Update Q by the common rate and invert Q. Return the energy of Q over noise."""
     over = 0.0
     for a in range(3):
         for b in range(3):

@@ -109,7 +109,10 @@ def widen_scales(params: Constants, states: ErrorStates) -> None:
 
 @compiled
 def inflate_delays(params: Constants, kf: Estimator, units: int) -> None:
-    """Widen the delays of units whose channels are all in ``units``; of the reference unit: all delays."""
+    """Widen the delays of units whose channels are all in ``units``.
+
+    All delays if the reference unit is among them: they are relative to it.
+    """
     for u in range(1, params.units):
         if params.members[u] & ~units == 0 or params.members[0] & ~units == 0:
             place = params.layout.delays[u]
@@ -140,7 +143,7 @@ def variance_since(params: Constants, kf: Estimator, snapshot: Snapshot) -> floa
 
 @compiled
 def best_snapshot(params: Constants, kf: Estimator, seconds: float) -> int:
-    """Find the snapshot until a time, s, since which the biases have changed least; -1: none.
+    """Find the snapshot until a time, s, since which the biases have changed least, or -1.
 
     This is the last one, unless the specific force was another one then.
     """
@@ -166,7 +169,7 @@ def best_snapshot(params: Constants, kf: Estimator, seconds: float) -> int:
 def predict_from(
     params: Constants, kf: Estimator, seconds: float, states: ErrorStates
 ) -> bool:
-    """Predict the present states from the best snapshot until a time, s; return whether one exists."""
+    """Predict the present states from the best snapshot until a time, s. Return whether one exists."""
     best = best_snapshot(params, kf, seconds)
     if best < 0:
         return False
