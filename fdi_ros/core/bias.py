@@ -64,8 +64,12 @@ FALSE_SWAY = 0.001
 def restart_bias(core: NDArray[Any]) -> None:
     """Begin a new average of the bias. ``core`` has shape (1,)."""
     bias = core[0]["bias"]
-    # Without a setting: 2 s, which reduces white noise to less than a tenth.
-    bias["duration"] = bias["duration"] or 2_000_000_000
+    if not bias["duration"]:
+        # Without a setting: 2 s, which reduces white noise to less than a tenth.
+        bias["duration"] = 2_000_000_000
+        settings = core["settings"]
+        averaged = EFFICIENCY * 2.0 / settings["period"][0]
+        settings["learned"][0] = settings["sensors"]["noise_std"][0] / averaged**0.5
     bias["learning"] = True
     bias["started"] = False
     bias["outcome"] = LEARNING

@@ -240,3 +240,20 @@ def clear_declarations(core: NDArray[Any]) -> int:
         decision.why[i] = UNDECLARED
     forget_alarms(decision, settings)
     return declared
+
+
+@compiled
+def clear_disagreements(core: NDArray[Any]) -> None:
+    """Clear sets, suspicions and declarations that rest on the comparison of channels.
+
+    A channel that is stuck or not finite stays declared. ``core`` has shape (1,).
+    """
+    decision = core[0].decision
+    settings = core[0].settings
+    decision.ambiguous = decision.voted = decision.suspicion = 0
+    for i in range(settings.n):
+        why = decision.why[i]
+        if why != STUCK and why != NOT_FINITE and why != INTERMITTENT:
+            decision.faulty &= ~(1 << i)
+            decision.why[i] = UNDECLARED
+    forget_alarms(decision, settings)

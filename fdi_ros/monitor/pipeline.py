@@ -17,7 +17,7 @@ from fdi_ros.compiling.compiled import allocate, reported
 from fdi_ros.config.config import PARAMETERS, Config
 from fdi_ros.core.alignment import MAX_STAMP
 from fdi_ros.core.bias import restart_bias
-from fdi_ros.core.decision import clear_declarations
+from fdi_ros.core.decision import clear_declarations, clear_disagreements
 from fdi_ros.core.level import update_level
 from fdi_ros.core.path import Path, begin_bias, run
 from fdi_ros.core.records import EventRow, OutputRow, Sample
@@ -300,7 +300,11 @@ class Pipeline:
         self.integrity.prepare(self.subsets)
 
     def supply(self) -> None:
-        """Prepare what the sample path has asked for; what was learned by the word of a copy of a unit is void."""
+        """Prepare what the path has requested.
+
+        A new copy of a unit has spoken as a second witness: what rests on the comparison
+        of channels is cleared.
+        """
         for half in self.halves:
             half._supply()
 
@@ -308,7 +312,7 @@ class Pipeline:
         core = self.core[0]
         if core["copies"]["found"]:
             core["copies"]["found"] = False
-            clear_declarations(self.core)
+            clear_disagreements(self.core)
             for detector in self.detectors:
                 detector.reset()
             begin_bias(core)

@@ -17,7 +17,7 @@ from fdi_ros.compiling.compiled import Callback, allocate
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, as_block
 from fdi_ros.core.copies import copies_among
-from fdi_ros.core.decision import clear_declarations
+from fdi_ros.core.decision import clear_declarations, clear_disagreements
 from fdi_ros.core.live import MORE, NO_STAMP, process
 from fdi_ros.core.messages import ImuTemplate, MessageError, as_batch
 from fdi_ros.core.path import Path
@@ -282,6 +282,7 @@ class Receiver:
         self.alignment.is_live(0)
         _ = self.alignment.are_parted
         clear_declarations(path.core)
+        clear_disagreements(path.core)
 
 
 _FEW_CHANNELS = 5  # channels for a method that does not take six

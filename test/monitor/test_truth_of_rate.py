@@ -11,6 +11,7 @@ import pytest
 from monitor.streams import RATE, SIGMA, START, config, parallel
 
 from fdi_ros.model.samples import Block
+from fdi_ros.monitor.output import ChannelState
 from fdi_ros.monitor.pipeline import Pipeline
 
 MILLISECOND = 1_000_000
@@ -118,6 +119,34 @@ def test_smooth_values_make_no_copy_where_noise_would_hide_the_motion(size, copi
     z = np.tile(0.5 * size * swung(time), 2)
     pipeline.process(Block(START + np.arange(600) * 10 * MILLISECOND, z))
     assert bool(pipeline.core["copies"]["channels"][0]) == copied
+
+
+def test_a_channel_without_numbers_stays_faulty_where_a_copy_is_found():
+    """imu_1.x sends NaN from 3 to 4.5 s, and imu_3 repeats imu_2 from 6 s on."""
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    time = np.arange(1500) / RATE
+    z = np.tile(0.3 * swung(time), 3)
+    z += np.random.default_rng(0).normal(0.0, SIGMA, z.shape)
+    z[300:450, 0] = np.nan
+    z[600:, 6:] = z[600:, 3:6]
+    output = pipeline.process(Block(START + np.arange(1500) * 10 * MILLISECOND, z))
+    assert pipeline.core["copies"]["channels"][0]
+    assert (output.state[450:, 0] == ChannelState.FAULTY).all()
+    assert not (output.state[:, 1:6] == ChannelState.FAULTY).any()
+
+
+def test_a_bias_that_is_learned_anew_is_known_as_well_without_a_start_up_average():
+    z = np.random.default_rng(0).normal(0.0, SIGMA, (800, 9))
+    block = Block(START + np.arange(800) * 10 * MILLISECOND, z)
+    known = []
+    for duration in (0.0, 2.0):
+        changes = {"bias__startup_bias_duration": duration}
+        pipeline = Pipeline(parallel(3, detector__name="sequential", **changes))
+        pipeline.process(block[:300])
+        pipeline.relearn_bias()
+        known.append(pipeline.process(block[300:]))
+    np.testing.assert_allclose(known[0].covariance, known[1].covariance, rtol=0.05)
+    np.testing.assert_allclose(known[0].level, known[1].level, rtol=0.05)
 
 
 def test_the_bias_of_a_unit_at_half_the_rate_is_learned():
