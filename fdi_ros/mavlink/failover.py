@@ -16,8 +16,6 @@ from pathlib import Path
 from fdi_ros.mavlink.failover_evidence import SILENCE, Evidence
 from fdi_ros.mavlink.failover_file import FailoverFile, Saved
 from fdi_ros.mavlink.failover_policy import (
-    VEHICLE,
-    Condition,
     Imu,
     PolicySettings,
     PolicyState,
@@ -29,14 +27,22 @@ from fdi_ros.mavlink.failover_raw import CURRENT
 from fdi_ros.mavlink.failover_ready import (
     EKF_LANES,
     INS_USE,
-    MONITOR_LATE,
     Facts,
     doubt,
     not_ready,
 )
-from fdi_ros.mavlink.failover_words import CONDITION_WORDS, imu_name, imu_text
+from fdi_ros.mavlink.failover_words import (
+    SIZING,
+    Condition,
+    Note,
+    Readiness,
+    WordsState,
+    announce,
+    imu_name,
+    text_of,
+)
 from fdi_ros.mavlink.protocol import ARDUPILOT, ENOUGH, MS, NS, ImuSample
-from fdi_ros.mavlink.report import INFO, TEXT_LENGTH, WARNING
+from fdi_ros.mavlink.report import TEXT_LENGTH
 from fdi_ros.mavlink.vehicle import Vehicle
 from fdi_ros.monitor.diagnostics import Level
 from fdi_ros.system.clocks import Clocks
@@ -51,10 +57,7 @@ READ_HURRIED = 50 * MS  #: The same while an order may depend on the parameters,
 USE_KNOWN_FOR = 10 * NS  #: An older report of a parameter is not known any more, ns.
 #: A monitor without diagnostics for this time is in doubt, ns.
 REPORTED_WITHIN = 5 * NS
-SIZING = 200 * MS  #: Longest wait of a text for the size of an error, ns.
 COUNTED = 5 * NS  #: Losses are counted over this time, ns.
-#: Readiness must have changed for this time to be announced, ns.
-ANNOUNCED_AFTER = 3 * NS
 BOOT_STEP = 3 * NS  #: A boot time that grows by more is another boot, ns,
 #: if the autopilot's time has gone back, or after this time over a link that is quick, ns.
 BACKLOG = 10 * NS
@@ -108,6 +111,7 @@ class Failover:
         saved = self._file.written
         self._system = saved.system
         self._state = PolicyState.begin(count, saved.out, saved.without_notch)
+        self._words = WordsState((Note(),) * count)
         self._values: list[tuple[bool | None, int]] = [(None, 0)] * count
         self._lanes: int | None = None  # of `EKF_LANES`. None: not reported
         self._conversation = 0
@@ -121,8 +125,7 @@ class Failover:
         self._unsized: dict[int, int] = {}  # IMUs out of use, not announced yet: since
         self._counted = (0, 0, 0)  # time, ns, and messages lost and received until then
         self._lost = math.nan  # share of messages lost of late
-        self._ready: tuple[str, int] = ("", 0)  # the present reason, and since when
-        self._told: str | None = None  # the reason announced last
+        self._readiness = Readiness()
 
     @property
     def out(self) -> tuple[int, ...]:
@@ -171,13 +174,8 @@ class Failover:
         self._try_orders(view, now)
         for imu, use in decision.orders:
             self._vehicle.set_parameter(INS_USE[imu], float(use))
-        for imu, condition in decision.words:
-            if condition == Condition.OUT:
-                self._unsized[imu] = now
-            else:
-                self._unsized.pop(imu, None)
-                self._announce(imu, condition)
-        self._announce_out(now)
+        self._announce_conditions(view, now)
+        self._count_losses(now)
         self._announce_readiness(view, now)
         if error := self._file.keep(self._saved(now), now):
             self._vehicle.events.append(error)
@@ -215,7 +213,7 @@ class Failover:
 
     def restore(self, now: int) -> tuple[bool, str]:
         """Ask to put all IMUs back. Return whether that was done, and an answer."""
-        ours = ", ".join(imu_name(imu, self._channels) for imu in self.out)
+        ours = self._names(self.out)
         if not ours:
             return True, "no IMU is out of use by failover"
         if not self._view(now).linked:
@@ -225,34 +223,30 @@ class Failover:
 
     def status(self, now: int) -> tuple[Level, str]:
         """Return level and words for the diagnostics."""
-        if self.out:
-            words = self._out_words()
-            is_saved = self._file.written.out == self.out
-            unsaved = "" if is_saved else "; failover_file is not written"
-            ending = "; reboot before flight" if self._without_notch else ""
-            if self._vehicle.system is None:
-                ending = "; no autopilot is heard yet"
-            elif not self._is_same:
-                ending = f"; no failover of system {self._vehicle.system}"
-            return Level.WARN, words + unsaved + ending
-        why = self._not_ready(self._view(now), now)
-        return (Level.WARN, f"no failover: {why}") if why else (Level.OK, "ready")
+        view = self._view(now)
+        facts = self._facts(view, now)
+        if not self.out:
+            why = self._not_ready(view, facts, now)
+            return (Level.WARN, f"no failover: {why}") if why else (Level.OK, "ready")
+        why = doubt(view, facts)
+        asked = [k for k in self.out if self._is_asked(k)]
+        out = [k for k in self.out if k not in asked]
+        parts = (
+            (out, f"out of use: {self._names(out)} of system {self._system}"),
+            (asked, f"ordered out, reported in use: {self._names(asked)}"),
+            (self._file.written.out != self.out, "failover_file is not written"),
+            (self._without_notch and self._is_same, "reboot before flight"),
+            (why, f"no failover: {why}"),
+        )
+        return Level.WARN, "; ".join(words for holds, words in parts if holds)
 
-    def _out_words(self) -> str:
-        """Return which IMUs are out of use, and which were ordered out without effect."""
-        memories = self._state.memories
-        out: list[str] = []
-        asked: list[str] = []
-        for k in self.out:
-            still_used = memories[k].seen is True and memories[k].held
-            place = asked if still_used else out
-            place.append(imu_name(k, self._channels))
-        parts = []
-        if out:
-            parts.append(f"out of use: {', '.join(out)} of system {self._system}")
-        if asked:
-            parts.append(f"ordered out, reported in use: {', '.join(asked)}")
-        return "; ".join(parts)
+    def _is_asked(self, imu: int) -> bool:
+        """Return whether an IMU was ordered out of use, but is reported in use."""
+        memory = self._state.memories[imu]
+        return memory.held and memory.seen is True
+
+    def _names(self, imus: Sequence[int]) -> str:
+        return ", ".join(imu_name(imu, self._channels) for imu in imus)
 
     def _note_boot(self, now: int) -> None:
         """Note a start of the autopilot: its clock has gone back, or is behind for long."""
@@ -359,53 +353,46 @@ class Failover:
             restore=restore,
         )
 
-    def _announce(
-        self, imu: int, condition: Condition, error: tuple[str, float] | None = None
-    ) -> None:
-        severity, words = CONDITION_WORDS[condition]
-        of_imu = imu_text(imu, condition, self._channels, error)
-        self._say(severity, f"FDI: {words}" if imu == VEHICLE else of_imu)
-
-    def _announce_out(self, now: int) -> None:
-        """Announce IMUs that went out of use, once their errors are known or `SIZING` is over."""
+    def _announce_conditions(self, view: View, now: int) -> None:
+        """Announce conditions, that of `OUT` once the error is known or `SIZING` is over."""
+        memories = self._state.memories
+        self._words, words = announce(self._words, memories, view, now, self._settings)
+        for key, condition in words:
+            self._unsized.pop(key, None)
+            if condition is Condition.OUT:
+                self._unsized[key] = now
+            else:
+                severity = condition.value.severity
+                self._say(severity, text_of(key, condition, self._channels))
         for imu, since in list(self._unsized.items()):
             error = self.evidence.error(imu, now)
             if error is not None or now - since >= SIZING:
                 del self._unsized[imu]
-                self._announce(imu, Condition.OUT, error)
+                text = text_of(imu, Condition.OUT, self._channels, error)
+                self._say(Condition.OUT.value.severity, text)
 
     def _say(self, severity: int, text: str) -> None:
+        text = text[:TEXT_LENGTH]
         self._vehicle.send_text(severity, text)
         self._vehicle.events.append(text)
 
-    def _announce_readiness(self, view: View, now: int) -> None:
-        """Announce that failover is ready, or not any more and why, once that lasts."""
-        vehicle = self._vehicle
+    def _count_losses(self, now: int) -> None:
         at, lost, received = self._counted
         if now - at >= COUNTED:
-            self._counted = (now, vehicle.counts["lost"], vehicle.counts["in use"])
-            more = self._counted[1] - lost
-            self._lost = more / max(1, more + self._counted[2] - received)
-        # An IMU that is out of use is announced by itself.
-        why = (
-            doubt(view, self._facts(view, now))
-            if self.out
-            else self._not_ready(view, now)
-        )
-        if why != self._ready[0]:
-            self._ready = (why, now)
-        is_late = why == MONITOR_LATE
-        if not vehicle.in_reach or (
-            now - self._ready[1] < ANNOUNCED_AFTER and not is_late
-        ):
-            return
-        if self.out and not why and not self._told:
-            return
-        if why != self._told and (view.armed or not why):
-            self._told = why
-            fine = "failover acts again" if self.out else "failover is ready"
-            words = f"no failover: {why}" if why else fine
-            self._say(WARNING if why else INFO, f"FDI: {words}"[:TEXT_LENGTH])
+            counts = self._vehicle.counts
+            self._counted = (now, counts["lost"], counts["in use"])
+            more = counts["lost"] - lost
+            self._lost = more / max(1, more + counts["in use"] - received)
+
+    def _announce_readiness(self, view: View, now: int) -> None:
+        """Announce that failover is ready, or not any more and why, once that lasts."""
+        facts = self._facts(view, now)
+        is_out = bool(self.out)
+        why = doubt(view, facts) if is_out else self._not_ready(view, facts, now)
+        may_warn = view.armed and self._vehicle.in_reach
+        self._readiness, words = self._readiness.hear(why, is_out, may_warn, now)
+        if words is not None:
+            self._say(words.severity, f"FDI: {words.text}")
 
     def _facts(self, view: View, now: int) -> Facts:
         """Return what readiness depends on beside the view."""
@@ -414,15 +401,13 @@ class Failover:
             lost=self._lost,
             trip=self._vehicle.sync.trip(now),
             is_slow=self._is_slow(view, now),
-            other=None if self._is_same else self._system,
+            other=None if self._is_same or not self._vehicle.system else self._system,
             is_file_fine=not self._file.trouble,
             has_lanes=self._lanes is not None,
             obeys=self._probe.obeys,
         )
 
-    def _not_ready(self, view: View, now: int) -> str:
-        """Return why a fault might go unanswered now. Empty: every fault would be answered."""
-        facts = self._facts(view, now)
+    def _not_ready(self, view: View, facts: Facts, now: int) -> str:
         return not_ready(self._state.memories, view, facts, now, self._settings)
 
     def _is_slow(self, view: View, now: int) -> bool:

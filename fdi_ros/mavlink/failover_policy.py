@@ -4,8 +4,9 @@
 """Rules of failover: which IMUs of an ArduPilot are to be out of use now.
 
 `decide` is a pure function, called at every tick (10 to 50 times a second), that takes
-the present view and its own memory, and returns orders, conditions to announce, and
-the next memory. It has no clock and no link. An order sets INS_USEk.
+the present view and its own memory, and returns orders and the next memory. It has no
+clock and no link. An order sets INS_USEk. `failover_words` has the texts for the pilot,
+`failover_ready` the conditions of "ready".
 
 Definitions
     apart    raw rate differs by ``min_size`` or more, and more than scales explain, from
@@ -50,9 +51,8 @@ An IMU that somebody else has set is left alone until the vehicle is disarmed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 from typing import NamedTuple
 
 from fdi_ros.mavlink.protocol import MS, NS
@@ -70,54 +70,14 @@ QUICK_RETRY = 100 * MS  #: Time between the first `QUICK_TRIES` copies of an ord
 QUICK_TRIES = 10
 SLOW_RETRY = NS  #: Time between further copies, ns.
 GROUNDED = 2 * NS  #: The flight is over after this time disarmed, ns.
-REACTION = NS  #: A bad IMU in use is announced after this time, ns.
-UNNAMED = 5 * NS  #: An IMU that is apart, but not named, is announced after this, ns.
+#: An IMU counts as dead, or as off by less than those in use, after this time, ns, and as
+#: a danger to be announced.
+REACTION = NS
 ACQUAINTED = 5 * NS  #: Agreement needed once before failover is ready, ns.
-REPEAT = 10 * NS  #: Time between two announcements of a lasting danger, ns.
-SPACED = NS  #: Least time between two announcements that are not urgent, ns.
-#: Angle by which an EKF lane is lost, rad: what its IMU turned too much or too little. In
-#: ArduCopter's simulation lanes recover from 0.4 rad within 10 s, and never from 3 rad.
-LOST_LANE = 1.5
-LANE_RECOVERY = 10.0  #: Time constant with which a lane recovers from less, s.
 #: An IMU goes back beside the last ones in use if these are off by this many times as much.
 #: At 2, 4 and 8 the worst IMU in use of 150 random flights is off by the same within 1 %.
 LESSER = 4.0
 LONG_AGO = -(10**18)  #: A time before all others, ns.
-
-
-class Condition(Enum):
-    """State of an IMU or of the vehicle, announced to the pilot at its beginning."""
-
-    FINE = "in use and not bad"
-    DANGER = "bad, in use, armed"
-    OUT = "out of use by our order, armed"
-    STAYS_OUT = "out of use by our order on the ground, because it is still named"
-    NOT_OK = "out of use by our order on the ground, not named and not found OK"
-    UNTURNED = "as before, and found OK, but not seen to agree while turning"
-    REBOOT = (
-        "on the ground, was out of use when the autopilot started: no notch filters"
-    )
-    STUCK_OUT = "ordered back, but not reported in use"
-    LEFT_ALONE = "set by somebody else in this flight, or put back by the operator"
-    UNUSED = "out of use, and not by our order"
-    APART = "apart for long, while two others agree"
-    DISAGREE = "an IMU in use is apart for long, armed, and the monitor finds none OK"
-    ALONE = "one IMU is alive, or none but samples arrive, armed"
-    REDUNDANT = "two or more IMUs in use that agree, and EKF lanes that are not lost"
-    LAST_IMU = "one IMU in use, or none, because of our orders"
-    LAST_LANE = "one EKF lane, or none, is not lost, and others are, armed"
-
-
-#: Announced at once. The others change at most every `SPACED` for one IMU or the vehicle.
-URGENT = {Condition.DANGER, Condition.OUT, Condition.ALONE, Condition.LAST_IMU}
-#: Announced every `REPEAT`.
-REPEATED = {
-    Condition.DANGER,
-    Condition.ALONE,
-    Condition.DISAGREE,
-    Condition.LAST_IMU,
-    Condition.LAST_LANE,
-}
 
 
 class PolicySettings(NamedTuple):
@@ -176,12 +136,9 @@ class Memory:
     left_alone: bool = False
     without_notch: bool = False  #: Ours, and out of use at the autopilot's last start.
     acquainted: bool = False  #: Has once agreed with another IMU for `ACQUAINTED`.
-    bad_since: int | None = None
-    apart_since: int | None = None
     dead_since: int | None = None  #: Stuck, or without samples, since this time.
     lesser_since: int | None = None  #: Off by less than those in use, by `LESSER`.
     against_since: int | None = None  #: Since when reports contradict `seen`, ns.
-    lane_angle: float = 0.0  #: Angle by which its EKF lane was misled, rad.
 
 
 class Order(NamedTuple):
@@ -191,23 +148,11 @@ class Order(NamedTuple):
     use: bool
 
 
-class Announced(NamedTuple):
-    """The last announcement about one IMU or the vehicle."""
-
-    condition: Condition
-    at: int  #: Time, ns.
-
-
-VEHICLE = -1  #: Key of the vehicle's own announcement beside those of the IMUs.
-
-
 class PolicyState(NamedTuple):
     """Memory between two ticks."""
 
     memories: tuple[Memory, ...]
-    announced: Mapping[int, Announced] = {}
     boots: int = 0
-    at: int = LONG_AGO  #: Time of the last tick.
 
     @classmethod
     def begin(
@@ -240,7 +185,6 @@ class Decision(NamedTuple):
     """Result of one tick."""
 
     orders: tuple[Order, ...]
-    words: tuple[tuple[int, Condition], ...]  #: IMU, or `VEHICLE`, and its condition.
     state: PolicyState
     hurry: bool  #: All INS_USE should be read at once: an order may depend on them.
 
@@ -258,6 +202,11 @@ def is_bad(imu: Imu, settings: PolicySettings) -> bool:
 def is_sound(imu: Imu, settings: PolicySettings) -> bool:
     """Return whether the autopilot can fly with an IMU alone."""
     return is_alive(imu) and (imu.ok or imu.size < settings.min_size)
+
+
+def has_stood(since: int | None, duration: int, now: int) -> bool:
+    """Return whether a condition that began at since, ns, has lasted for a duration, ns."""
+    return since is not None and now - since >= duration
 
 
 def is_alive(imu: Imu) -> bool:
@@ -298,13 +247,12 @@ def objection(
 def decide(
     state: PolicyState, view: View, now: int, settings: PolicySettings
 ) -> Decision:
-    """Return orders, conditions to announce and the next state at time now, ns."""
+    """Return orders and the next state at time now, ns."""
     memories = tuple(Memory(**vars(memory)) for memory in state.memories)
     for memory, imu in zip(memories, view.imus, strict=True):
         if view.boots != state.boots:
             _begin_anew(memory)
-        _remember(memory, imu, view, now, settings)
-    _note_lanes(memories, view, now - state.at, settings)
+        _remember(memory, imu, view, now)
     _release(memories, view, now, settings)
     _hold_worst(memories, view, now, settings)
     orders = []
@@ -312,26 +260,6 @@ def decide(
         if _is_due(k, memories, view, now, settings):
             orders.append(Order(k, not memory.held))
             _note_order(memory, now)
-    announced = dict(state.announced)
-    words = []
-    # Without a link nobody would read them.
-    found = _conditions(memories, view, now) if view.linked else []
-    for key, condition in found:
-        is_fine = condition is Condition.FINE
-        is_near = is_fine and view.imus[key].size < settings.min_size
-        if is_fine and not (is_near and memories[key].seen):
-            # Off, but not for long, or nobody is the odd one, or unknown.
-            continue
-        if condition is Condition.REDUNDANT and not _is_redundant(memories, view):
-            continue
-        usual = Condition.REDUNDANT if key == VEHICLE else Condition.FINE
-        last = announced.get(key, Announced(usual, LONG_AGO))
-        waits = 0 if condition in URGENT else SPACED
-        is_changed = condition != last.condition and now - last.at >= waits
-        is_late = condition in REPEATED and now - last.at >= REPEAT
-        if is_changed or is_late:
-            announced[key] = Announced(condition, now)
-            words.append((key, condition))
     doubtful = any(
         imu.named or (is_apart(imu, settings) and not imu.ok) for imu in view.imus
     )
@@ -341,8 +269,7 @@ def decide(
     )
     return Decision(
         orders=tuple(orders),
-        words=tuple(words),
-        state=PolicyState(memories, announced, view.boots, now),
+        state=PolicyState(memories, view.boots),
         hurry=(view.armed and doubtful) or unsettled,
     )
 
@@ -351,14 +278,11 @@ def _begin_anew(memory: Memory) -> None:
     """Forget what a start of the autopilot ends. Parameters outlive it."""
     # The next report shows how it began.
     memory.seen = memory.obeyed = memory.against_since = None
-    memory.lane_angle = 0.0
     memory.tries = 0
     memory.held = memory.without_notch = memory.ours  # until reported in use
 
 
-def _remember(
-    memory: Memory, imu: Imu, view: View, now: int, settings: PolicySettings
-) -> None:
+def _remember(memory: Memory, imu: Imu, view: View, now: int) -> None:
     """Update a memory from the present view, before any decision."""
     if view.restore and memory.ours:
         memory.left_alone = True
@@ -367,13 +291,8 @@ def _remember(
     if view.disarmed >= GROUNDED:
         memory.left_alone = False
         memory.taken = 0
-        memory.lane_angle = 0.0
     if imu.agreed is not None and now - imu.agreed >= ACQUAINTED:
         memory.acquainted = True
-    is_danger = view.armed and is_bad(imu, settings)
-    memory.bad_since = (memory.bad_since or now) if is_danger else None
-    is_off = is_apart(imu, settings)
-    memory.apart_since = (memory.apart_since or now) if is_off else None
     memory.dead_since = None if is_alive(imu) else (memory.dead_since or now)
 
 
@@ -409,32 +328,11 @@ def _hear(memory: Memory, use: bool, heard: int) -> None:
         # order was lost.
         by_others = use and changed and memory.out_sent != LONG_AGO
     is_over = use and settled
-    if memory.seen is False and use:
-        memory.apart_since = None
     memory.seen = use
     if by_others or (memory.ours and is_over):
         memory.ours = memory.held = False
         memory.tries = 0
         memory.left_alone |= by_others
-
-
-def _note_lanes(
-    memories: Sequence[Memory], view: View, elapsed: int, settings: PolicySettings
-) -> None:
-    """Follow how far each EKF lane was misled in the time elapsed, ns.
-
-    Lane k follows IMU k, or the first IMU in use while IMU k is out.
-    """
-    first = next((k for k, memory in enumerate(memories) if memory.seen), 0)
-    seconds = min(max(elapsed, 0), NS) / NS
-    for k, memory in enumerate(memories):
-        source = view.imus[first if memory.seen is False else k]
-        # While two others are bad a healthy one is apart from both.
-        is_off = is_apart(source, settings) and (source.named or not source.ok)
-        if view.armed and source.delivers and is_off:
-            memory.lane_angle += source.size * seconds
-        elif memory.lane_angle < LOST_LANE:
-            memory.lane_angle *= max(0.0, 1.0 - seconds / LANE_RECOVERY)
 
 
 def _release(
@@ -448,7 +346,7 @@ def _release(
         memory.ours
         or imu.use is False
         or imu.stuck
-        or (is_heard and _has_stood(memory.dead_since, REACTION, now))
+        or (is_heard and has_stood(memory.dead_since, REACTION, now))
         for memory, imu in pairs
     )
     only_bad = all(memory.ours or is_bad(imu, settings) for memory, imu in pairs)
@@ -456,12 +354,12 @@ def _release(
     lesser = min(in_use, default=0.0) / LESSER
     for memory, imu in pairs:
         pause = min(FIRST_PAUSE << max(0, memory.taken - 1), LONGEST_PAUSE)
-        agrees = _has_stood(imu.agreed, pause, now)
+        agrees = has_stood(imu.agreed, pause, now)
         may = view.monitored if view.armed else imu.ok
         heals = agrees and may and is_alive(imu)
         is_lesser = only_bad and imu.least < lesser
         memory.lesser_since = (memory.lesser_since or now) if is_lesser else None
-        is_less = imu.ok or _has_stood(memory.lesser_since, REACTION, now)
+        is_less = imu.ok or has_stood(memory.lesser_since, REACTION, now)
         is_better = only_bad and view.monitored and is_less and is_alive(imu)
         wanted = (heals or is_better) and not memory.without_notch
         if memory.held and (view.restore or none_left or wanted):
@@ -519,74 +417,3 @@ def _note_order(memory: Memory, now: int) -> None:
         memory.out_sent = now
     else:
         memory.back_sent = now
-
-
-def _conditions(
-    memories: Sequence[Memory], view: View, now: int
-) -> list[tuple[int, Condition]]:
-    """Return the condition of each IMU and of the vehicle: the first that applies."""
-    longest = [_has_stood(memory.apart_since, UNNAMED, now) for memory in memories]
-    # Where no two agree, or the monitor finds none OK, nobody is the odd one.
-    is_any_ok = any(imu.ok for imu in view.imus)
-    is_odd_known = is_any_ok and not all(longest)
-    found = [
-        (k, _condition(memory, view.imus[k], view, now, longest[k] and is_odd_known))
-        for k, memory in enumerate(memories)
-    ]
-    is_heard = any(imu.delivers for imu in view.imus)
-    differs = any(
-        is_long and memory.seen is not False
-        for memory, is_long in zip(memories, longest, strict=True)
-    )
-    alive = sum(not _has_stood(memory.dead_since, REACTION, now) for memory in memories)
-    left = sum(memory.seen is not False for memory in memories)
-    pairs = zip(memories, view.imus, strict=True)
-    angles = [memory.lane_angle for memory, imu in pairs if imu.lane]
-    lanes = sum(angle < LOST_LANE for angle in angles)
-    by_us = any(memory.ours and memory.seen is False for memory in memories)
-    checks = (
-        (view.armed and is_heard and alive <= 1, Condition.ALONE),
-        (view.armed and by_us and left <= 1, Condition.LAST_IMU),
-        (view.armed and lanes <= 1 and lanes < len(angles), Condition.LAST_LANE),
-        (view.armed and differs and not is_any_ok, Condition.DISAGREE),
-    )
-    found.append((VEHICLE, _first(checks, Condition.REDUNDANT)))
-    return found
-
-
-def _is_redundant(memories: Sequence[Memory], view: View) -> bool:
-    """Return whether two or more IMUs are in use and agree."""
-    pairs = zip(memories, view.imus, strict=True)
-    return sum(bool(m.seen and imu.agreed is not None) for m, imu in pairs) > 1
-
-
-def _has_stood(since: int | None, duration: int, now: int) -> bool:
-    return since is not None and now - since >= duration
-
-
-def _condition(
-    memory: Memory, imu: Imu, view: View, now: int, apart: bool
-) -> Condition:
-    is_out = memory.ours and memory.seen is False
-    is_bad_long = _has_stood(memory.bad_since, REACTION, now)
-    is_danger = view.armed and memory.seen is not False and is_bad_long
-    asked_back = memory.ours and not memory.held and memory.tries > QUICK_TRIES
-    checks = (
-        (is_danger, Condition.DANGER),
-        (asked_back, Condition.STUCK_OUT),
-        (is_out and not view.armed and memory.without_notch, Condition.REBOOT),
-        (is_out and not view.armed and imu.named is True, Condition.STAYS_OUT),
-        (is_out and not view.armed and not imu.ok, Condition.NOT_OK),
-        # Until it is reported in use, also once it has been ordered back.
-        (is_out and not view.armed, Condition.UNTURNED),
-        (is_out, Condition.OUT),
-        (memory.left_alone, Condition.LEFT_ALONE),
-        (memory.seen is False, Condition.UNUSED),
-        (apart, Condition.APART),
-    )
-    return _first(checks, Condition.FINE)
-
-
-def _first(checks: Sequence[tuple[bool, Condition]], usual: Condition) -> Condition:
-    """Return the first condition that holds, or else the usual one."""
-    return next((condition for holds, condition in checks if holds), usual)

@@ -1,9 +1,16 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether failover is ready: a fault of any IMU in use would be answered now.
+"""Whether failover is ready. Pure functions that return the first reason against it.
 
-Pure functions, which return the first reason against it.
+`doubt`
+    Why no fault at all is sure to be answered: the first three reasons stop all orders,
+    with the others an order may come late or not at all.
+`not_ready`
+    The same, and why a fault of some IMU might go unanswered. Failover is ready if there is
+    no reason, so never while an IMU is out of use.
+
+In both the reasons stand in the order in which they count.
 """
 
 from __future__ import annotations
@@ -53,16 +60,16 @@ class Facts(NamedTuple):
 
 
 def doubt(view: View, facts: Facts) -> str:
-    """Return why no fault of any IMU would be answered now. Empty: no reason."""
+    """Return why no fault at all is sure to be answered now. Empty: no reason."""
     trip = facts.trip
     checks = (
         (facts.other is not None, f"failover_file is of system {facts.other}"),
+        (not view.linked, "no ArduPilot that sends each IMU"),
+        (not view.monitored, "monitor silent or not alone"),
         (not abs(facts.age) <= LARGEST_AGE, MONITOR_LATE),
         (facts.lost > LARGEST_LOSS, "link loses messages"),
         (facts.is_slow, "IMUs come too slowly"),
         (trip is None or trip > LARGEST_READY_TRIP, "link is slow"),
-        (not view.linked, "no ArduPilot that sends each IMU"),
-        (not view.monitored, "monitor silent or not alone"),
     )
     return next((words for holds, words in checks if holds), "")
 
@@ -75,8 +82,9 @@ def not_ready(
     settings: PolicySettings,
 ) -> str:
     """Return why a fault might go unanswered at time now, ns. Empty: no reason."""
-    reasons = _reasons(memories, view, facts, now, settings)
-    return doubt(view, facts) or next(reasons, "")
+    return doubt(view, facts) or next(
+        _reasons(memories, view, facts, now, settings), ""
+    )
 
 
 def _reasons(
@@ -86,18 +94,14 @@ def _reasons(
     now: int,
     settings: PolicySettings,
 ) -> Iterator[str]:
-    against = _objections(memories, view, now, settings)
-    for imu, why in zip(view.imus, against, strict=True):
-        if imu.use and why:
-            yield why
-    if not any(imu.use for imu in view.imus):
-        yield against[0]
+    view = _without_late_answers(memories, view, now)
     for k, (memory, imu) in enumerate(zip(memories, view.imus, strict=True)):
         name = f"IMU {k + 1}"
         checks = (
             (memory.without_notch, "reboot before flight"),
             (imu.use is None, f"use of {name} is not reported"),
             (imu.use is False, f"{name} not in use"),
+            (memory.left_alone, f"{name} left alone until disarmed"),
             (imu.blamed, f"{name} faulty and in use"),
             (is_apart(imu, settings), f"{name} differs and is in use"),
             (not imu.delivers, f"{name} sends nothing"),
@@ -115,17 +119,31 @@ def _reasons(
         (len(memories) < 3, "two IMUs: no third to decide"),
     )
     yield from (words for holds, words in whole if holds)
+    yield from filter(None, _objections(memories, view, now, settings))
+
+
+def _without_late_answers(memories: Sequence[Memory], view: View, now: int) -> View:
+    """Return the view with fresh reports, and without those that the policy ignores.
+
+    Soon after an order ArduPilot may answer a read with the value from before it.
+    """
+    imus = []
+    for memory, imu in zip(memories, view.imus, strict=True):
+        is_ignored = imu.use is not None and memory.against_since is None
+        use = memory.seen if is_ignored else imu.use
+        imus.append(imu._replace(use=use, heard=now))
+    return view._replace(imus=tuple(imus))
 
 
 def _objections(
     memories: Sequence[Memory], view: View, now: int, settings: PolicySettings
 ) -> list[str]:
     """Return what there would be against an order for each IMU, if it was bad in flight."""
-    # With fresh reports.
-    imus = [imu._replace(heard=now if imu.heard else 0) for imu in view.imus]
     against = []
-    for k, imu in enumerate(imus):
+    for k, imu in enumerate(view.imus):
         bad = imu._replace(blamed=True, size=math.inf, delivers=True)
-        trial = view._replace(armed=True, imus=(*imus[:k], bad, *imus[k + 1 :]))
+        trial = view._replace(
+            armed=True, imus=(*view.imus[:k], bad, *view.imus[k + 1 :])
+        )
         against.append(objection(k, memories, trial, now, settings))
     return against

@@ -1,15 +1,56 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Texts of failover for the pilot: one sentence for each condition of an IMU."""
+"""Texts of failover for the pilot: one sentence for each condition of an IMU.
+
+Each IMU, and the vehicle, has one condition at a time: the first in its part of `Condition`
+that holds. `announce` compares it with the last one announced:
+
+1. A new condition is announced at once if it is urgent, else at the earliest `SPACED` after
+   the last text about the same IMU or the vehicle.
+2. A repeated one is announced again every `REPEAT` while it lasts.
+3. While no condition holds, nothing is announced, and the last condition counts on.
+4. At the start the last ones are `FINE` and `REDUNDANT`, so these two are announced only
+   after another.
+5. Without a link nothing is announced.
+
+The text of `OUT` waits `SIZING` at most for the size of the error. `Readiness` announces
+whether failover itself works.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from enum import Enum
 from typing import NamedTuple
 
-from fdi_ros.mavlink.failover_policy import Condition
+from fdi_ros.mavlink.failover_policy import (
+    GROUNDED,
+    LONG_AGO,
+    QUICK_TRIES,
+    REACTION,
+    Memory,
+    PolicySettings,
+    View,
+    has_stood,
+    is_apart,
+    is_bad,
+)
+from fdi_ros.mavlink.failover_ready import MONITOR_LATE
+from fdi_ros.mavlink.protocol import MS, NS
 from fdi_ros.mavlink.report import CRITICAL, INFO, TEXT_LENGTH, WARNING
+
+UNNAMED = 5 * NS  #: An IMU that is apart, but not named, is announced after this, ns.
+REPEAT = 10 * NS  #: Time between two announcements of a lasting danger, ns.
+SPACED = NS  #: Least time between two announcements that are not urgent, ns.
+SIZING = 200 * MS  #: Longest wait of a text for the size of an error, ns.
+#: Readiness must have changed for this time to be announced, ns.
+ANNOUNCED_AFTER = 3 * NS
+#: Angle by which an EKF lane is lost, rad: what its IMU turned too much or too little. In
+#: ArduCopter's simulation lanes recover from 0.4 rad within 10 s, and never from 3 rad.
+LOST_LANE = 1.5
+LANE_RECOVERY = 10.0  #: Time constant with which a lane recovers from less, s.
+VEHICLE = -1  #: Key of the vehicle beside the numbers of the IMUs.
 
 
 class Words(NamedTuple):
@@ -17,26 +58,240 @@ class Words(NamedTuple):
 
     severity: int  #: MAV_SEVERITY.
     text: str  #: What follows "FDI: ", or for an IMU "FDI: IMU 1 ".
+    urgent: bool = False  #: Announced at once.
+    repeated: bool = False  #: Announced again every `REPEAT`.
 
 
-CONDITION_WORDS = {
-    Condition.FINE: Words(INFO, "in use, differs no more"),
-    Condition.DANGER: Words(CRITICAL, "faulty AND IN USE: land"),
-    Condition.OUT: Words(CRITICAL, "out of use"),
-    Condition.STAYS_OUT: Words(CRITICAL, "still faulty, stays out of use"),
-    Condition.NOT_OK: Words(WARNING, "stays out, monitor finds it not OK"),
-    Condition.UNTURNED: Words(WARNING, "stays out until turned by hand"),
-    Condition.REBOOT: Words(CRITICAL, "no notch: set INS_USE{} 1 and reboot"),
-    Condition.STUCK_OUT: Words(WARNING, "not back in use, though asked"),
-    Condition.LEFT_ALONE: Words(WARNING, "left alone until disarmed"),
-    Condition.UNUSED: Words(WARNING, "not in use, not by failover"),
-    Condition.APART: Words(WARNING, "differs from the others"),
-    Condition.DISAGREE: Words(CRITICAL, "the IMUs disagree: land"),
-    Condition.ALONE: Words(CRITICAL, "one IMU or none is alive: land"),
-    Condition.REDUNDANT: Words(INFO, "two IMUs or more agree again"),
-    Condition.LAST_IMU: Words(CRITICAL, "one IMU left in use: land"),
-    Condition.LAST_LANE: Words(CRITICAL, "one EKF lane left: land"),
-}
+class Condition(Enum):
+    """Conditions and their sentences. The first that holds counts.
+
+    `imu_condition` and `vehicle_condition` say when each holds, in the same order.
+    """
+
+    # Of an IMU.
+    DANGER = Words(CRITICAL, "faulty AND IN USE: land", urgent=True, repeated=True)
+    STUCK_OUT = Words(WARNING, "not back in use, though asked")
+    REBOOT = Words(CRITICAL, "no notch: set INS_USE{} 1 and reboot")
+    STAYS_OUT = Words(CRITICAL, "still faulty, stays out of use")
+    NOT_OK = Words(WARNING, "stays out, monitor finds it not OK")
+    UNTURNED = Words(WARNING, "stays out until turned by hand")
+    OUT = Words(CRITICAL, "out of use", urgent=True)
+    LEFT_ALONE = Words(WARNING, "left alone until disarmed")
+    UNUSED = Words(WARNING, "not in use, not by failover")
+    APART = Words(WARNING, "differs from the others")
+    FINE = Words(INFO, "in use, differs no more")
+    # Of the vehicle.
+    ALONE = Words(
+        CRITICAL, "one IMU or none is alive: land", urgent=True, repeated=True
+    )
+    LAST_IMU = Words(CRITICAL, "one IMU left in use: land", urgent=True, repeated=True)
+    LAST_LANE = Words(CRITICAL, "one EKF lane left: land", repeated=True)
+    DISAGREE = Words(CRITICAL, "the IMUs disagree: land", repeated=True)
+    REDUNDANT = Words(INFO, "two IMUs or more agree again")
+
+
+class Note(NamedTuple):
+    """What the words remember of one IMU. Times in ns."""
+
+    bad_since: int | None = None  #: Bad, in use and armed since this time.
+    apart_since: int | None = None  #: In use, apart, and no `DANGER`, since this time.
+    lane_angle: float = 0.0  #: Angle by which its EKF lane was misled, rad.
+
+
+class Announced(NamedTuple):
+    """The last announcement about one IMU or the vehicle."""
+
+    condition: Condition
+    at: int  #: Time, ns.
+
+
+class WordsState(NamedTuple):
+    """Memory between two ticks."""
+
+    notes: tuple[Note, ...]
+    announced: Mapping[int, Announced] = {}
+    boots: int = 0
+    at: int = LONG_AGO  #: Time of the last tick, ns.
+
+
+def announce(
+    state: WordsState,
+    memories: Sequence[Memory],
+    view: View,
+    now: int,
+    settings: PolicySettings,
+) -> tuple[WordsState, list[tuple[int, Condition]]]:
+    """Return the next state, and the IMUs, or `VEHICLE`, with conditions to announce now.
+
+    The memories are those of the policy after its decision at time now, ns.
+    """
+    notes = _note(state, memories, view, now, settings)
+    found = {
+        k: imu_condition(k, notes, memories, view, now, settings)
+        for k in range(len(notes))
+    }
+    found[VEHICLE] = vehicle_condition(notes, memories, view, now)
+    announced = dict(state.announced)
+    words = []
+    for key, condition in found.items():
+        if condition is None or not view.linked:
+            continue
+        usual = Condition.REDUNDANT if key == VEHICLE else Condition.FINE
+        last = announced.get(key, Announced(usual, LONG_AGO))
+        if condition is last.condition:
+            is_due = condition.value.repeated and now - last.at >= REPEAT
+        else:
+            is_due = condition.value.urgent or now - last.at >= SPACED
+        if is_due:
+            announced[key] = Announced(condition, now)
+            words.append((key, condition))
+    return WordsState(notes, announced, view.boots, now), words
+
+
+def imu_condition(
+    k: int,
+    notes: Sequence[Note],
+    memories: Sequence[Memory],
+    view: View,
+    now: int,
+    settings: PolicySettings,
+) -> Condition | None:
+    """Return the condition of IMU k. None: nothing is to be announced."""
+    memory = memories[k]
+    imu = view.imus[k]
+    is_out = memory.ours and memory.seen is False
+    stays = is_out and not view.armed
+    asked_back = memory.ours and not memory.held and memory.tries > QUICK_TRIES
+    # Where no two agree, or the monitor finds none OK, nobody is the odd one.
+    two_agree = not all(is_apart(each, settings) for each in view.imus)
+    is_odd_known = two_agree and any(each.ok for each in view.imus)
+    is_long_apart = has_stood(notes[k].apart_since, UNNAMED, now)
+    is_near = imu.size < settings.min_size
+    checks = (
+        (has_stood(notes[k].bad_since, REACTION, now), Condition.DANGER),
+        (asked_back, Condition.STUCK_OUT),
+        # On the way back.
+        (is_out and not memory.held, None),
+        (stays and memory.without_notch, Condition.REBOOT),
+        (stays and imu.named is True, Condition.STAYS_OUT),
+        (stays and not imu.ok, Condition.NOT_OK),
+        (stays and imu.agreed is None, Condition.UNTURNED),
+        # It agrees, and goes back after its pause.
+        (stays, None),
+        (is_out, Condition.OUT),
+        (memory.left_alone, Condition.LEFT_ALONE),
+        (memory.seen is False, Condition.UNUSED),
+        (is_long_apart and is_odd_known, Condition.APART),
+        (memory.seen and is_near, Condition.FINE),
+    )
+    return next((condition for holds, condition in checks if holds), None)
+
+
+def vehicle_condition(
+    notes: Sequence[Note],
+    memories: Sequence[Memory],
+    view: View,
+    now: int,
+) -> Condition | None:
+    """Return the condition of the vehicle. None: nothing is to be announced."""
+    is_heard = any(imu.delivers for imu in view.imus)
+    alive = sum(not has_stood(memory.dead_since, REACTION, now) for memory in memories)
+    left = sum(memory.seen is not False for memory in memories)
+    by_us = any(memory.ours and memory.seen is False for memory in memories)
+    angles = [
+        note.lane_angle for note, imu in zip(notes, view.imus, strict=True) if imu.lane
+    ]
+    lanes = sum(angle < LOST_LANE for angle in angles)
+    differs = any(has_stood(note.apart_since, UNNAMED, now) for note in notes)
+    is_any_ok = any(imu.ok for imu in view.imus)
+    agreeing = [
+        imu.agreed is not None and memory.seen
+        for memory, imu in zip(memories, view.imus, strict=True)
+    ]
+    checks = (
+        (view.armed and is_heard and alive <= 1, Condition.ALONE),
+        (view.armed and by_us and left <= 1, Condition.LAST_IMU),
+        (view.armed and lanes <= 1 and lanes < len(angles), Condition.LAST_LANE),
+        (view.armed and differs and not is_any_ok, Condition.DISAGREE),
+        (sum(map(bool, agreeing)) > 1, Condition.REDUNDANT),
+    )
+    return next((condition for holds, condition in checks if holds), None)
+
+
+def _note(
+    state: WordsState,
+    memories: Sequence[Memory],
+    view: View,
+    now: int,
+    settings: PolicySettings,
+) -> tuple[Note, ...]:
+    """Return what is remembered of each IMU from now on.
+
+    EKF lane k follows IMU k, or the first IMU in use while IMU k is out.
+    """
+    is_anew = view.boots != state.boots or view.disarmed >= GROUNDED
+    seconds = min(max(now - state.at, 0), NS) / NS
+    first = next((k for k, memory in enumerate(memories) if memory.seen), 0)
+    notes = []
+    for k, (note, memory) in enumerate(zip(state.notes, memories, strict=True)):
+        imu = view.imus[k]
+        in_use = memory.seen is not False
+        is_danger = in_use and view.armed and is_bad(imu, settings)
+        bad_since = (note.bad_since or now) if is_danger else None
+        # The pilot has been warned: what is left of a danger is no news for a while.
+        is_off = is_apart(imu, settings) and not has_stood(bad_since, REACTION, now)
+        apart_since = (note.apart_since or now) if in_use and is_off else None
+        angle = 0.0 if is_anew else note.lane_angle
+        source = view.imus[k if in_use else first]
+        # While two others are bad a healthy one is apart from both.
+        is_misled = is_apart(source, settings) and (source.named or not source.ok)
+        if view.armed and source.delivers and is_misled:
+            angle += source.size * seconds
+        elif angle < LOST_LANE:
+            angle *= max(0.0, 1.0 - seconds / LANE_RECOVERY)
+        notes.append(Note(bad_since, apart_since, angle))
+    return tuple(notes)
+
+
+class Readiness(NamedTuple):
+    """Memory of the texts on failover itself.
+
+    1. ``no failover: REASON`` while armed and heard, once the reason has stood for `ANNOUNCED_AFTER`,
+       a late monitor at once.
+    2. ``failover is ready`` once no reason has stood for that time: the first time, and
+       after such a text. While an IMU is out of use: ``failover acts again``, only after
+       such a text.
+    """
+
+    why: str | None = None  #: Present reason. Empty: none. None: not known yet.
+    since: int = LONG_AGO  #: When it began, ns.
+    announced: str | None = None  #: Reason announced last.
+
+    def hear(
+        self, why: str, is_out: bool, may_warn: bool, now: int
+    ) -> tuple[Readiness, Words | None]:
+        """Return the next memory, and the words to announce now, or None.
+
+        Parameters
+        ----------
+        why
+            Reason against failover: `failover_ready.not_ready`, or `failover_ready.doubt`
+            while an IMU is out of use, as that is announced by itself.
+        is_out
+            Whether one is.
+        may_warn
+            Whether the vehicle is armed and heard.
+        now
+            Time, ns.
+        """
+        state = self if why == self.why else self._replace(why=why, since=now)
+        stands = why == MONITOR_LATE or now - state.since >= ANNOUNCED_AFTER
+        is_news = may_warn if why else not (is_out and not self.announced)
+        if why == self.announced or not stands or not is_news:
+            return state, None
+        fine = "failover acts again" if is_out else "failover is ready"
+        words = Words(WARNING, f"no failover: {why}") if why else Words(INFO, fine)
+        return state._replace(announced=why), words
 
 
 def imu_name(imu: int, channels: Sequence[str]) -> str:
@@ -49,13 +304,13 @@ def imu_name(imu: int, channels: Sequence[str]) -> str:
     return f"IMU {imu + 1}" if repeats else f"IMU {imu + 1} ({name})"
 
 
-def imu_text(
-    imu: int,
+def text_of(
+    key: int,
     condition: Condition,
     channels: Sequence[str],
     error: tuple[str, float] | None = None,
 ) -> str:
-    """Return the sentence for an IMU, from 0.
+    """Return the text for an IMU, from 0, or `VEHICLE`.
 
     Parameters
     ----------
@@ -65,12 +320,13 @@ def imu_text(
         Axis and size, rad/s, in REP-103 axes. The text has ArduPilot's: y to the right,
         z down.
     """
+    words = condition.value.text
+    if key == VEHICLE:
+        return f"FDI: {words}"
     # ArduPilot's parameters are INS_USE, INS_USE2, INS_USE3.
-    words = CONDITION_WORDS[condition].text.format(imu + 1 if imu else "")
+    words = words.format(key + 1 if key else "")
     if error is not None:
         axis, size = error
         words += f" (gyro {axis} {size if axis == 'x' else -size:+.2f} rad/s)"
-    text = f"FDI: {imu_name(imu, channels)} {words}"
-    return (text if len(text) <= TEXT_LENGTH else f"FDI: IMU {imu + 1} {words}")[
-        :TEXT_LENGTH
-    ]
+    text = f"FDI: {imu_name(key, channels)} {words}"
+    return text if len(text) <= TEXT_LENGTH else f"FDI: IMU {key + 1} {words}"

@@ -29,6 +29,7 @@ from fdi_ros.mavlink.failover_policy import (
     View,
     decide,
 )
+from fdi_ros.mavlink.failover_words import Note, WordsState, announce
 
 MS = 1_000_000
 NS = 1000 * MS
@@ -48,6 +49,7 @@ class Flight:
         self.slow = int(random.choice([10, 100, 400])) * MS
         self.now = 100 * NS
         self.state = PolicyState.begin(self.count)
+        self.words = WordsState((Note(),) * self.count)
         self.done = Counter[str]()
         self.under_way: list[tuple[int, Callable[[], None]]] = []
         every = range(self.count)
@@ -205,7 +207,11 @@ class Flight:
         decision = decide(self.state, view, self.now, self.settings)
         self.state = decision.state
         self.hurry = decision.hurry
-        for _, condition in decision.words:
+        memories = self.state.memories
+        self.words, words = announce(
+            self.words, memories, view, self.now, self.settings
+        )
+        for _, condition in words:
             self.done[condition.name] += 1
         for order in decision.orders:
             self.check_order(order, view)

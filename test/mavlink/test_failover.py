@@ -24,8 +24,8 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink import failover_file
 from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
 from fdi_ros.mavlink.failover_file import FailoverFile
-from fdi_ros.mavlink.failover_policy import Condition, PolicySettings
-from fdi_ros.mavlink.failover_words import CONDITION_WORDS, imu_name, imu_text
+from fdi_ros.mavlink.failover_policy import PolicySettings
+from fdi_ros.mavlink.failover_words import Condition, imu_name, text_of
 from fdi_ros.system.clocks import Clocks
 from mavlink.autopilots import (
     EKF_LANES,
@@ -1199,7 +1199,10 @@ def test_a_file_of_another_vehicle_is_announced(tmp_path: Path) -> None:
     talk.fault(1, 0.5, seconds=6.0)
     assert not autopilot.sets
     assert talk.texts == ["no failover: failover_file is of system 7"]
-    assert reason(talk) == "out of use: IMU 2 of system 7; no failover of system 1"
+    assert (
+        reason(talk)
+        == "out of use: IMU 2 of system 7; no failover: failover_file is of system 7"
+    )
 
 
 def test_a_late_monitor_is_announced_while_an_imu_is_out(flying: Monitored) -> None:
@@ -1215,8 +1218,7 @@ def test_a_late_monitor_is_announced_while_an_imu_is_out(flying: Monitored) -> N
 
 
 def test_no_two_conditions_have_the_same_words_and_each_fits() -> None:
-    texts = [words.text for words in CONDITION_WORDS.values()]
-    assert set(CONDITION_WORDS) == set(Condition)
+    texts = [condition.value.text for condition in Condition]
     assert len(set(texts)) == len(texts)
     assert max(len(f"FDI: IMU 1 {text}") for text in texts) <= 50
 
@@ -1235,7 +1237,7 @@ def test_a_unit_is_named_where_its_name_is_more_than_the_number(
 ) -> None:
     channels = [f"{unit}.{axis}" if unit else axis for axis in "xyz"]
     assert imu_name(1, ["a.x", "a.y", "a.z", *channels]) == name
-    text = imu_text(1, Condition.OUT, ["a.x", "a.y", "a.z", *channels])
+    text = text_of(1, Condition.OUT, ["a.x", "a.y", "a.z", *channels])
     assert text == f"FDI: {name} out of use"
 
 

@@ -58,14 +58,30 @@ def test_all_good_is_ready_and_two_imus_are_not() -> None:
         ({"linked": False}, "no ArduPilot that sends each IMU"),
         ({"monitored": False}, "monitor silent or not alone"),
         ({"second": {"use": None}}, "use of IMU 2 is not reported"),
-        ({"second": {"use": False}}, "IMU 2 not in use"),
+        ({"memory": {"seen": False}}, "IMU 2 not in use"),
         ({"second": {"agreed": None}}, "IMU 2 agrees with none"),
         ({"second": {"delivers": False}}, "IMU 2 sends nothing"),
         ({"second": {"size": 0.05}}, "IMU 2 differs and is in use"),
         ({"second": {"lane": False}}, "EK3_IMU_MASK is without IMU 2"),
         ({"memory": {"acquainted": False}}, "IMU 2 not seen to agree yet"),
-        ({"memory": {"left_alone": True}}, "set by others"),
+        ({"memory": {"left_alone": True}}, "IMU 2 left alone until disarmed"),
     ],
 )
 def test_each_doubt_has_its_sentence(given: dict[str, Any], words: str) -> None:
     assert reason(**given) == words
+
+
+def test_a_late_answer_that_the_policy_ignores_changes_nothing() -> None:
+    """ArduPilot answers a read with the value from before our order."""
+    late = {"second": {"use": False}}
+    assert reason(memory={"seen": True}, **late) == ""
+    disputed = {"seen": True, "against_since": NOW}
+    assert reason(memory=disputed, **late) == "IMU 2 not in use"
+
+
+def test_the_gravest_reason_comes_first() -> None:
+    """A link that is silent is not slow, and an IMU has its name before a rule has its."""
+    silent = {"facts": {"trip": None}, "linked": False, "monitored": False}
+    assert reason(**silent) == "no ArduPilot that sends each IMU"
+    faulty = {"blamed": True, "size": 0.5, "agreed": None}
+    assert reason(second=faulty) == "IMU 2 faulty and in use"
