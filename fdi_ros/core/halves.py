@@ -6,7 +6,8 @@
 Both pass the same path. A specific force f enters as the rate f / natural, so that one
 set of constants in rad/s serves both. Accelerometers follow the gyros, because their
 lever arms need the rate: a unit at r from the first measures ``alpha x r + omega x
-(omega x r)`` in addition.
+(omega x r)`` in addition. In samples without a sure rate this is unknown, and such units
+are hidden: neither judged nor fused.
 """
 
 from __future__ import annotations
@@ -14,12 +15,17 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import Vector, compiled
-from fdi_ros.core.records import Core, Sample, Turning
-from fdi_ros.model.samples import Array
+from fdi_ros.core.acceleration import differentiate_rate
+from fdi_ros.core.algebra import along, square
+from fdi_ros.core.records import Core, PathSettings, Sample, Turning
+from fdi_ros.core.repeated import is_at_rest
 
 TURN_TIME = 0.05
 """Time constant of the rotation that displaces accelerometers, s: a block and a little more.
 The derivative of single samples is mostly noise."""
+HOLE = 2.0
+"""Samples by which the difference of two rates may be longer than its window, because of
+the distance of samples and one lost sample."""
 
 
 @compiled
@@ -39,16 +45,14 @@ def give_sample(core: Core, gyros: Core, sample: Sample, half: int) -> None:
             given.received[i] = sample.received[i]
         else:
             place = settings.places[i]
-            given.z[i] = sample.force[place]
+            given.z[i] = sample.force[place] / settings.natural
             given.received[i] = sample.felt[place]
     if half == 1:
-        if settings.lever:
-            take_off_lever_arms(core, gyros, given.z)
-        follow_turn(core.turning, gyros.last.rate, sample.stamp)
+        follow_turn(core, gyros, sample.stamp)
+        fill_parts(core)
         for a in range(3):
             core.sample.spin[a] = core.turning.newest[a]
         for i in range(settings.n):
-            given.z[i] /= settings.natural
             core.sample.position_std[i] = settings.position_std[i]
             core.sample.displaced[i] = displaced_variance(core, i)
 
@@ -63,10 +67,18 @@ def give_force(core: Core, accelerometers: Core) -> None:
 
 
 @compiled
-def follow_turn(turning: Turning, rate: Vector, stamp: int) -> None:
-    """Follow the rotation of the body with the fused rate (3,) of a sample, rad/s."""
+def follow_turn(core: Core, gyros: Core, stamp: int) -> None:
+    """Follow the rotation of the body with the fused rate of the gyros in the same sample."""
+    turning = core.turning
+    rate = gyros.last.rate
     since = (stamp - turning.stamp) * 1e-9
     turning.stamp = stamp
+    is_measured = measures_turn(core, gyros)
+    for a in range(3):
+        turning.usable[a] = rate[a] if is_measured else math.nan
+    turning.unsmoothed.window = gyros.acceleration.window
+    differentiate_rate(turning.unsmoothed, stamp, turning.usable)
+    turning.known = is_measured and spans_no_hole(core.settings, turning, stamp)
     if not math.isfinite(rate[0]):
         return
     for a in range(3):
@@ -74,6 +86,46 @@ def follow_turn(turning: Turning, rate: Vector, stamp: int) -> None:
         step = rate[a] - turning.rate[a]
         turning.rate[a] += step * min(since / TURN_TIME, 1.0)
         turning.acceleration[a] = step / TURN_TIME if since < TURN_TIME else 0.0
+
+
+@compiled
+def measures_turn(core: Core, gyros: Core) -> bool:
+    """Whether the fused rate is of this sample, and sure enough for the lever arms.
+
+    An error e of the rate changes what a turn omega adds at a distance r by up to
+    ``(2 omega + e) e r``. This must be less than the noise of the accelerometer.
+    """
+    if not gyros.last.valid or not is_new(gyros):
+        return False
+    settings = core.settings
+    rate = gyros.last.rate
+    covariance = gyros.last.covariance
+    doubt = covariance[0] + covariance[3] + covariance[5]
+    error = doubt * (4.0 * square(rate) + doubt) / settings.natural**2
+    for i in range(settings.n):
+        expected = settings.sensors.noise_std[i]
+        noise = max(expected * expected, core.sample.estimate.variance[i])
+        if error * square(settings.arms[i]) > noise:
+            return False
+    return True
+
+
+@compiled
+def is_new(gyros: Core) -> bool:
+    """Whether the fused rate has a new value, or the vehicle rests, where values may repeat."""
+    now = gyros.now
+    for i in range(gyros.settings.n):
+        if now.fused >> i & 1 and gyros.health.run_stamp[i] == gyros.last.stamp:
+            return True
+    return is_at_rest(gyros.settings, now) and not now.all_repeat
+
+
+@compiled
+def spans_no_hole(settings: PathSettings, turning: Turning, stamp: int) -> bool:
+    """Whether the angular acceleration is a difference over its window, and not over a hole."""
+    longest = turning.unsmoothed.window + round(HOLE * 1e9 * settings.period)
+    since = stamp - turning.unsmoothed.last_rate.stamp
+    return turning.unsmoothed.has_last_rate == 1 and since <= longest
 
 
 @compiled
@@ -103,20 +155,36 @@ def displaced_variance(core: Core, i: int) -> float:
 
 
 @compiled
-def take_off_lever_arms(core: Core, gyros: Core, force: Array) -> None:
-    """Subtract the accelerations by rotation of the body at each accelerometer, m/s^2."""
-    omega = gyros.last.rate
-    alpha = gyros.acceleration.value
+def fill_parts(core: Core) -> None:
+    """Calculate what the rotation of the body adds to each accelerometer.
+
+    If the rotation is not known, all accelerometers away from the first unit are hidden,
+    also those of unknown position: what it adds is no fault.
+    """
+    turning = core.turning
     settings = core.settings
-    if not math.isfinite(omega[0]):
-        return
+    turning.hidden = 0
     for i in range(settings.n):
         arm = settings.arms[i]
-        axis = settings.sensors.axes[i]
-        along = omega[0] * arm[0] + omega[1] * arm[1] + omega[2] * arm[2]
-        square = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
-        for a in range(3):
-            b = (a + 1) % 3
-            c = (a + 2) % 3
-            turning = alpha[b] * arm[c] - alpha[c] * arm[b]
-            force[i] -= axis[a] * (turning + omega[a] * along - square * arm[a])
+        turning.part[i] = 0.0
+        if turning.known:
+            turning.part[i] = added_by_turn(turning, arm, settings.sensors.axes[i])
+            turning.part[i] /= settings.natural
+        elif square(arm) > 0.0 or settings.position_std[i] > 0.0:
+            turning.hidden |= 1 << i
+
+
+@compiled
+def added_by_turn(turning: Turning, arm: Vector, axis: Vector) -> float:
+    """Return the acceleration by rotation of the body at a position (3,), along an axis (3,), m/s^2."""
+    omega = turning.usable
+    alpha = turning.unsmoothed.value
+    inward = along(omega, arm)
+    speed = square(omega)
+    added = 0.0
+    for a in range(3):
+        b = (a + 1) % 3
+        c = (a + 2) % 3
+        turn = alpha[b] * arm[c] - alpha[c] * arm[b]
+        added += axis[a] * (turn + omega[a] * inward - speed * arm[a])
+    return float(added)

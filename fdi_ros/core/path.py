@@ -266,7 +266,7 @@ def prepare_sample(path: Path, sample: Sample) -> None:
 
 @compiled
 def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
-    """Fill ``now.aligned`` with values of one instant.
+    """Fill ``now.aligned`` with values of one instant, less what a turn adds to accelerometers.
 
     Return the masks of the channels in range, and of the channels without a defect.
     """
@@ -274,10 +274,13 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
     aligned = core.now.aligned
     delivered = inside = plain = fine = 0
     for i in range(settings.n):
-        if sample.received[i]:
+        if core.turning.hidden >> i & 1:
+            sample.z[i] = math.nan
+        elif sample.received[i]:
             delivered |= 1 << i
             if abs(sample.z[i]) < core.health.limit[i]:
                 inside |= 1 << i
+            sample.z[i] -= core.turning.part[i]
         if core.health.condition[i] == FINE:
             fine |= 1 << i
     delivered = restamp(

@@ -467,6 +467,11 @@ class Turning:
     rate: Vector  # fused rate through a low pass of the first order, rad/s
     acceleration: Vector  # its derivative, rad/s^2
     newest: Vector  # fused rate of the last sample that had one, rad/s
+    usable: Vector  # fused rate of this sample, NaN if not sure enough, rad/s
+    unsmoothed: Acceleration  # of those rates
+    known: Flag  # rate and angular acceleration of this sample are known
+    part: Channels  # what it adds to each accelerometer, in the unit of the path
+    hidden: Mask  # accelerometers that it moves by an unknown amount
 
 
 @record
@@ -579,7 +584,6 @@ class PathSettings:
     natural: Real
     places: Counts  # index of each accelerometer in a sample
     arms: Axes  # position of each accelerometer from the first unit, m
-    lever: Flag  # a position is not zero
     # of each accelerometer's position along one axis, m over the natural size
     position_std: Channels
     sensors: Sensors

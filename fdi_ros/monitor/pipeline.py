@@ -335,7 +335,7 @@ class Pipeline:
             settings["natural"] = FORCE.natural
             arms = lever_arms(self.config, units)
             settings["places"][: len(arms)] = places(self.config, units)
-            settings["arms"][: len(arms)], settings["lever"] = arms, arms.any()
+            settings["arms"][: len(arms)] = arms
             std = position_std(self.config, units)
             settings["position_std"][: len(arms)] = std / FORCE.natural
             if self._in_flight:

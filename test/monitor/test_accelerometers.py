@@ -150,6 +150,77 @@ def test_known_lever_arms_are_taken_off():
     assert corrected < 1.2 * NOISE < 2 * NOISE < residual()
 
 
+def silent(block):
+    received = np.ones(block.z.shape, bool)
+    received[300:500] = False
+    return replace(block, received=received)
+
+
+def one_axis_silent(block):
+    received = np.ones(block.z.shape, bool)
+    received[300:500, [2, 5, 8]] = False
+    return replace(block, received=received)
+
+
+def frozen(block):
+    z = block.z.copy()
+    z[300:500] = z[300]
+    return replace(block, z=z)
+
+
+def with_holes(block):
+    received = np.ones(block.z.shape, bool)
+    received[np.arange(len(block)) % 40 < 20] = False
+    return replace(block, received=received)
+
+
+def two_disagree(block):
+    z = block.z.copy()
+    z[300:, 3:6] += 1.5
+    return replace(block, z=z)
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(
+    ("without_rate", "units", "changes"),
+    [
+        (lambda block: block, 3, {"bias__startup_bias_duration": 3.0}),
+        (silent, 3, {}),
+        (one_axis_silent, 3, {}),
+        (frozen, 3, {}),
+        (with_holes, 3, {}),
+        (two_disagree, 2, {}),
+    ],
+    ids=["start-up average", "silent", "axis", "frozen", "holes", "disagreement"],
+)
+def test_no_accelerometer_is_suspected_where_the_gyros_give_no_sure_rate(
+    without_rate, units, changes, known
+):
+    """Lever arms of 0.1 m in turns of 4 rad/s: 1.6 m/s^2 beside noise of 0.15."""
+    if known:
+        changes = changes | {"accelerometers__positions": ARMS[:units].ravel()}
+    for seed in range(3):
+        block, force = flight(700, units, seed=seed, arms=ARMS, size=4.0)
+        block = without_rate(block)
+        output = Pipeline(settings(units, **changes)).process(block).acceleration
+        assert not [event for event in output.events if event.declares]
+        assert output.valid.all()
+        assert (np.abs(output.rate - force) < output.level).all()
+        assert (output.state[:, 3:] == ChannelState.OK).mean() < 0.9
+
+
+def test_an_accelerometer_at_its_limit_is_out_of_range_also_on_a_lever_arm():
+    """Less its lever arm the value lies 2 m/s^2 below the limit."""
+    block, _ = flight(700, arms=ARMS, size=4.0)
+    limit = 13.0
+    block.acceleration.z[300:500, [2, 5, 8]] = limit
+    changes = {"accelerometers__max_acceleration": limit}
+    positions = {"accelerometers__positions": ARMS.ravel()}
+    output = Pipeline(settings(**changes, **positions)).process(block).acceleration
+    assert not [event for event in output.events if event.after == ChannelState.FAULTY]
+    assert (output.state[300:500, [2, 5, 8]] == ChannelState.SUSPECT).all()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_unknown_lever_arms_are_no_faults_and_are_in_the_covariance(seed):
     """Units 0.1 m apart in turns of 6 rad/s: 3.6 m/s^2 beside noise of 0.15."""
