@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.health import (
+    CERTAIN_BEYOND,
     INTERMITTENT_SHARE,
-    NON_FINITE_LASTING,
+    broken_channels,
     intermittent_channels,
 )
 from fdi_ros.core.records import Core, Current, PathSettings, SampleInput
@@ -39,11 +40,10 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
     evidence.checked = subsets[core.sample.mask].detectable if evidence.judged else 0
     evidence.checked &= core.sample.estimate.checked
     evidence.no_votes = core.sample.in_recovery
-    evidence.broken = evidence.repeats = evidence.agrees = clear = 0
+    evidence.broken = broken_channels(settings, health, evidence.stamp)
+    evidence.repeats = evidence.agrees = clear = 0
     may_return = not settings.latch and core.decision.faulty != 0
     for i in range(settings.n):
-        if health.condition[i] == NON_FINITE_LASTING:
-            evidence.broken |= 1 << i
         if (
             settings.stuck_time
             and evidence.stamp - health.run_stamp[i] >= settings.stuck_time
@@ -63,7 +63,11 @@ def gather_evidence(core: Core, subsets: NDArray[Any]) -> int:
             if abs(evidence.error[i]) <= settings.return_limit * math.sqrt(variance):
                 evidence.agrees |= 1 << i
     evidence.intermittent = intermittent_channels(
-        health.gone, health.leaves, settings.n, INTERMITTENT_SHARE
+        settings,
+        health,
+        health.gone,
+        health.leaves,
+        (INTERMITTENT_SHARE, CERTAIN_BEYOND),
     )
     evidence.unclear = unclear_members(core)
     clear &= now.usable

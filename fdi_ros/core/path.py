@@ -34,7 +34,13 @@ from fdi_ros.core.decision import (
 from fdi_ros.core.evidence import fill_suspects, gather_evidence
 from fdi_ros.core.fusion import fuse
 from fdi_ros.core.halves import give_force, give_sample
-from fdi_ros.core.health import FINE, OUT_OF_RANGE, check, leave_flickering
+from fdi_ros.core.health import (
+    FINE,
+    OUT_OF_RANGE,
+    check,
+    leave_flickering,
+    unit_of,
+)
 from fdi_ros.core.judging import (
     is_prepared,
     judge_corrected,
@@ -42,7 +48,7 @@ from fdi_ros.core.judging import (
     take_verdict,
 )
 from fdi_ros.core.level import update_level
-from fdi_ros.core.records import Bank, Core, PathSettings, Sample
+from fdi_ros.core.records import Bank, Core, Sample
 from fdi_ros.core.repeated import all_repeat, update_repeated, without_coarse_steps
 from fdi_ros.core.restamping import restamp
 from fdi_ros.core.states import alive, left_out, out_of_use, update_states, write_events
@@ -395,15 +401,6 @@ def extend_spell(core: Core, i: int, times: float) -> None:
         longest.until[i] = stamp
         longest.samples[i] = last.samples[i]
         longest.times[i] = last.times[i]
-
-
-@compiled
-def unit_of(settings: PathSettings, i: int) -> int:
-    """Return the mask of the unit of a channel, or of the channel if it has no unit."""
-    for unit in range(settings.units):
-        if settings.members[unit] >> i & 1:
-            return int(settings.members[unit])
-    return 1 << i
 
 
 @compiled

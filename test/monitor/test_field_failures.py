@@ -522,3 +522,28 @@ def test_a_value_that_repeats_beside_another_fault_widens_no_set(size, seed):
         "imu_2.z",
     }
     assert "imu_1.x" not in {name for name, _ in found}
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize(
+    ("settings", "share"), [(TWO, 0.2), (THREE, 0.2), (THREE, 0.4)]
+)
+def test_values_that_the_bus_loses_in_all_units_make_no_gyro_faulty(
+    settings, share, whole
+):
+    """Each value or message is lost at random; imu_2.y gives no number at all from 20 s on."""
+    pipeline = Pipeline(settings)
+    block = stream(pipeline.geometry, 2500)
+    lost = np.random.default_rng(3).random(block.z.shape) < share
+    block.z[lost[:, ::3].repeat(3, axis=1) if whole else lost] = np.nan
+    block.z[2000:, 4] = np.nan
+    output = pipeline.process(block)
+    assert declarations(pipeline, output) == [("imu_2.y", "FAULTY")]
+    assert [event.row >= 2000 for event in output.events if event.declares] == [True]
+    assert output.valid[:2000].mean() > 0.75
+    error = np.abs(output.rate - body_rate(2500))
+    assert (error < 6.0 * np.sqrt(output.covariance[:, [0, 1, 2], [0, 1, 2]]))[
+        output.valid
+    ].all()
+    # Where enough is delivered, the others still check a channel.
+    assert (output.state[:2000, :6] == ChannelState.OK).mean() > 0.3
