@@ -406,6 +406,9 @@ class BootClock:
     #: Times further back, or further ahead than the time that has passed here, are a step,
     #: ns: a start of the autopilot, or of its clock.
     BACK, AHEAD = NS, 2 * NS
+    #: For this time, ns, all times must be a step: over a second path, copies of messages
+    #: may come seconds late, those of all units together, between the present ones.
+    LASTS = 200 * MS
     _OVER = (1 << 32) * MS
 
     def __init__(self) -> None:
@@ -416,7 +419,8 @@ class BootClock:
         """Begin anew with the next time."""
         self._latest: int | None = None
         self._lead = 0  # largest time less time here, ns: with the least delay
-        self._odd = 0
+        self._odd = 0  # steps in a row
+        self._odd_since = 0
 
     def unwrap(
         self, time: int, now: int, milliseconds: bool, about: int | None = None
@@ -439,7 +443,9 @@ class BootClock:
             self._lead = max(lead, time - now)
             return time
         self._odd += 1
-        if self._odd >= BELIEVED_AFTER:
+        if self._odd == 1:
+            self._odd_since = now
+        if self._odd >= BELIEVED_AFTER and now - self._odd_since >= self.LASTS:
             self.restarts += 1
             self.reset()
         return None

@@ -240,10 +240,23 @@ def test_a_clock_that_begins_anew_is_found_and_a_single_wrong_time_is_not() -> N
         if k % 10 == 0:
             assert clock.unwrap(5 * NS, now, True) is None
     assert clock.restarts == 0
-    taken = [clock.unwrap(k * 20 * MS, now + k * 20 * MS, True) for k in range(10)]
+    steps = [k * 20 * MS for k in range(20)]
+    taken = [clock.unwrap(step, now + step, True) for step in steps]
     assert clock.restarts == 1
-    assert taken[:3] == [None] * 3
-    assert taken[3:] == [k * 20 * MS for k in range(3, 10)]
+    lasting = BootClock.LASTS // (20 * MS) + 1
+    assert taken == [None] * lasting + steps[lasting:]
+
+
+@pytest.mark.parametrize("late", [1500 * MS, 5 * NS])
+def test_late_copies_over_a_second_path_are_no_start(late: int) -> None:
+    """Those of three units come together, between the present ones."""
+    clock = BootClock()
+    for now in range(NS, 20 * NS, 20 * MS):
+        for _ in range(3):
+            assert clock.unwrap(100 * NS + now, now, True) == 100 * NS + now
+        for _ in range(3 if now > 10 * NS else 0):
+            assert clock.unwrap(100 * NS + now - late, now, True) is None
+    assert clock.restarts == 0
 
 
 def test_the_time_of_the_system_is_measured_between_interruptions() -> None:
