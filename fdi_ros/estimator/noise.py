@@ -277,7 +277,12 @@ def update_sample_noise(
             noise.largest[i] = max(energy, noise.largest[i])
             noise.steps[i] += min(square * inflation[i], THREE_SIGMA)
             noise.counted[i] += 1.0
-            step = square / max(1.0, BURST_FACTOR * noise.recent_ratio[i])
+            # Or turns, in which that uncertainty comes and goes, would look like volatile noise.
+            step = (
+                square
+                * inflation[i]
+                / max(1.0, BURST_FACTOR * noise.recent_ratio[i])
+            )
             if learn:
                 noise.neighbours[i] += gain * (
                     min(step * noise.squares[slot, i], FAR) - noise.neighbours[i]

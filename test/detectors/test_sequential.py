@@ -393,6 +393,41 @@ def test_a_delay_is_learned_in_slow_motion(late):
     assert status.delay_std[1] < 0.006
 
 
+def turning(pipeline, turn, seconds, seed):
+    """Values (N, 6) of the cone from 6 s on in turns of so many rad/s, scale factors and axes off by 0.2 %."""
+    rng = np.random.default_rng([seed, 60])
+    axes = pipeline.geometry.axes + 0.002 * rng.standard_normal((6, 3))
+    hertz, phase = rng.uniform(0.1, 0.3, 3), rng.uniform(0.0, 2 * np.pi, 3)
+    rate = turn * np.sin(2 * np.pi * np.outer(seconds, hertz) + phase)
+    begins = np.clip(seconds - 6.0, 0.0, 1.0)[:, None]
+    noise = pipeline.config.noise.noise_std[0]
+    return begins * rate @ axes.T + noise * white(seed, len(seconds))
+
+
+def test_in_turns_white_noise_has_no_tails_and_a_fault_is_declared_soon():
+    """A bias of eight standard deviations of one channel, a minute after the start.
+
+    The uncertainty of scale factors comes and goes with the turns, and is no change of the noise.
+    """
+    seconds = np.arange(0.0, 62.0, 1.0 / RATE)
+    pipeline = Pipeline.from_config("two_imus.yaml")
+    size = 8.0 * pipeline.config.noise.noise_std[0]
+    delays, degrees = [], []
+    for seed in range(12):
+        z = turning(pipeline, 0.5, seconds, seed)
+        z[6000:, seed % 6] += size
+        pipeline.restart()
+        state = pipeline.process(stamped(seconds, z)).state[:, seed % 6]
+        noise = pipeline.detector.states[0]["estimator"]["noise"]
+        degrees.append(noise["degrees"][:6].mean())
+        declared = (state == ChannelState.AMBIGUOUS) | (state == ChannelState.FAULTY)
+        assert not declared[:6000].any()
+        assert declared[6000:].any()
+        delays.append(int(declared[6000:].argmax()) + 1)
+    assert np.mean(degrees) > 30.0
+    assert np.mean(delays) < 5.0 * BOUND[8.0]
+
+
 def flown_with_a_hole(units, hole, fault, seed):
     """Parallel units in motion, no samples from 12 s on for so many s, in which imu_2.y comes to be off."""
     rng, seconds = (
