@@ -279,9 +279,7 @@ def update_sample_noise(
             noise.counted[i] += 1.0
             # Or turns, in which that uncertainty comes and goes, would look like volatile noise.
             step = (
-                square
-                * inflation[i]
-                / max(1.0, BURST_FACTOR * noise.recent_ratio[i])
+                square * inflation[i] / max(1.0, BURST_FACTOR * noise.recent_ratio[i])
             )
             if learn:
                 noise.neighbours[i] += gain * (
