@@ -6,7 +6,8 @@
 Two gyros differ by their noise. If a linear map of three channels explains the changes of
 three others from sample to sample, except for rounding, these are a copy, possibly rotated,
 scaled or delayed by some samples. An example is a topic that was mapped twice. A copy
-agrees with its original whatever the fault, so it is left out.
+agrees with its original whatever the fault, so the later one is left out, or the one that
+loses more values.
 """
 
 from __future__ import annotations
@@ -17,7 +18,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdi_ros.compiling.compiled import MAX_CHANNELS, allocate, compiled
-from fdi_ros.core.records import RESTAMP_SAMPLES, Copies, DelayBuffer, PathSettings
+from fdi_ros.core.records import (
+    RESTAMP_SAMPLES,
+    Copies,
+    DelayBuffer,
+    Health,
+    PathSettings,
+)
 from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import MAX_RATE, Array
 
@@ -34,11 +41,16 @@ HITS = 2
 #: Smallest changes, as a share of the noise. Smaller changes are smooth, and motion may
 #: explain them.
 SMALLEST_CHANGE = 0.02
+NONE, BOTH = -1, -2  #: In place of the number of a unit.
 
 
 @compiled
 def update_copies(
-    copies: Copies, settings: PathSettings, buffer: DelayBuffer, stamp: int
+    copies: Copies,
+    settings: PathSettings,
+    health: Health,
+    buffer: DelayBuffer,
+    stamp: int,
 ) -> None:
     """Compare all pairs of units once in `COMPARISON_PERIOD`. ``copies.found`` is set for a new copy."""
     if stamp - copies.stamp < COMPARISON_PERIOD or buffer.count < ROWS + 3:
@@ -46,28 +58,66 @@ def update_copies(
     copies.stamp = stamp
     for a in range(settings.units):
         for b in range(a + 1, settings.units):
-            if (
-                copies.original[a]
-                or copies.original[b]
-                or not is_copy(copies, settings, buffer, a, b)
-            ):
+            if copies.original[a] or copies.original[b]:
+                continue
+            later = later_unit(copies, settings, buffer, a, b)
+            if later == NONE:
+                # Unless too few values came to tell, they have agreed by chance before.
+                if is_comparable(copies, settings, buffer, a, b):
+                    copies.hits[a, b] = 0
                 continue
             copies.hits[a, b] += 1
-            if copies.hits[a, b] >= HITS:
-                copies.original[b] = a + 1
-                copies.channels |= settings.members[b]
-                copies.found = True
+            if copies.hits[a, b] < HITS:
+                continue
+            copy = later
+            if later == BOTH:
+                copy = (
+                    a
+                    if losses(settings, health, a) > losses(settings, health, b)
+                    else b
+                )
+            copies.original[copy] = (a if copy == b else b) + 1
+            copies.channels |= settings.members[copy]
+            copies.found = True
 
 
 @compiled
-def is_copy(
+def losses(settings: PathSettings, health: Health, unit: int) -> float:
+    """Return the share of values that a unit loses, added over its channels."""
+    total = 0.0
+    for i in range(settings.n):
+        if settings.members[unit] >> i & 1:
+            total += health.gone[i] + health.absent[i]
+    return total
+
+
+@compiled
+def is_comparable(
     copies: Copies, settings: PathSettings, buffer: DelayBuffer, a: int, b: int
 ) -> bool:
-    """Return whether one of two units delivers present or earlier values of the other."""
+    """Return whether both units gave enough values together for a comparison."""
+    first = first_of_three(settings.members[a])
+    second = first_of_three(settings.members[b])
+    return (
+        first >= 0
+        and second >= 0
+        and sum_changes(copies, buffer, first, second, 0, ROWS)
+    )
+
+
+@compiled
+def later_unit(
+    copies: Copies, settings: PathSettings, buffer: DelayBuffer, a: int, b: int
+) -> int:
+    """Return which of two units delivers earlier values of the other.
+
+    `BOTH` means that they deliver the same values in the same samples, and `NONE` that
+    they are different sensors.
+    """
     first = first_of_three(settings.members[a])
     second = first_of_three(settings.members[b])
     if first < 0 or second < 0:
-        return False
+        return NONE
     for lag in range(min(MAX_LAG, min(buffer.count, RESTAMP_SAMPLES) - ROWS - 2) + 1):
         for turned in range(2):
             source, target = (second, first) if turned else (first, second)
@@ -78,8 +128,10 @@ def is_copy(
                 )
                 agrees = agrees and is_explained(copies, settings, target, wanted)
             if agrees:
-                return True
-    return False
+                if lag == 0:
+                    return BOTH
+                return a if turned else b
+    return NONE
 
 
 @compiled
@@ -207,7 +259,7 @@ def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
         hits = 0
         for count in (size, size * 3 // 4, size // 2):
             buffer["count"] = max(count, ROWS + 3)
-            hits += is_copy(copies[0], settings[0], buffer[0], 0, 1)
+            hits += later_unit(copies[0], settings[0], buffer[0], 0, 1) != NONE
         if hits >= HITS:
             found.append((a, b))
     return found

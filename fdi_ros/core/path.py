@@ -236,7 +236,7 @@ def prepare_sample(path: Path, sample: Sample) -> None:
     core.samples += 1
     check(settings, core.health, sample)
     plain, fine = bring_together(core, sample)
-    update_copies(core.copies, settings, core.delay_buffer, stamp)
+    update_copies(core.copies, settings, core.health, core.delay_buffer, stamp)
     now.learned_from = False
     if core.bias.learning:
         learn_bias(path, stamp, plain)

@@ -602,6 +602,35 @@ def test_copies_are_found_where_messages_are_lost_and_no_others(
     )
 
 
+def later(z: NDArray[np.float64]) -> None:
+    z[3:, 0:3] = z[:-3, 3:6]
+
+
+def loses(z: NDArray[np.float64]) -> None:
+    z[:, 0:3] = z[:, 3:6]
+    z[np.random.default_rng(1).random(len(z)) < 0.05, 0:3] = np.nan
+
+
+@pytest.mark.parametrize("change", [later, loses])
+def test_of_two_topics_of_one_sensor_the_later_or_worse_one_is_left_out(change) -> None:
+    pipeline = Pipeline(parallel(3, **SEQUENTIAL))
+    block = stream(pipeline.geometry, 600)
+    change(block.z)
+    output = pipeline.process(block)
+    assert pipeline.status().copies == (("imu_2 (/imu_2)", "imu_1 (/imu_1)"),)
+    assert not (output.state[400:, 3:] == ChannelState.UNCHECKED).any()
+
+
+def test_two_units_that_agree_by_chance_now_and_then_are_no_copies() -> None:
+    """The noise of both is equal for half a second, every four seconds."""
+    pipeline = Pipeline(parallel(3, **SEQUENTIAL))
+    block = stream(pipeline.geometry, 1500)
+    for begin in range(90, 1500, 400):
+        block.z[begin : begin + 50, 3:6] = block.z[begin : begin + 50, 0:3]
+    pipeline.process(block)
+    assert pipeline.status().copies == ()
+
+
 TEXTS = st.text(
     st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=9
 )
