@@ -282,9 +282,8 @@ def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
         bias["learning"] = False
         bias["outcome"] = IN_MOTION if state["in_motion"] else RESTORED
         std = settings["turn_on"] if state["in_motion"] else settings["learned"][:n]
-        core["sample"]["bias_std"][:n] = np.sqrt(
-            std**2 + pipeline.config.noise.bias_walk[0] ** 2 * age
-        )
+        walk = np.array(pipeline.config.noise.bias_walk)
+        core["sample"]["bias_std"][:n] = np.sqrt(std**2 + walk**2 * age)
         core["remaining"][:n] = core["sample"]["bias_std"][:n]
     if state["errors"] is not None:
         # Known as well as their walk since then leaves them.

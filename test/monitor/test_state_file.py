@@ -302,3 +302,17 @@ def test_a_set_and_a_drift_outlive_a_restart(path):
     output = again.process(Block(block.stamp[301:320] + 10**12, block.z[301:320]))
     assert (output.state[:, [1, 4]] == ChannelState.AMBIGUOUS).all()
     assert again.status().channels[0].reason == Reason.DRIFTED
+
+
+def test_a_restored_bias_is_as_old_as_the_walk_of_its_own_channel(path):
+    walk = [1e-4, 2e-4, 3e-4, 1e-3, 2e-3, 3e-3]
+    settings = config(**LEARNING, noise__bias_walk=walk)
+    before, after = Pipeline(settings), Pipeline(settings)
+    before.process(rest(before))
+    StateFile(path, 3600.0).save(before)
+    saved = json.loads(path.read_text())
+    path.write_text(json.dumps({**saved, "saved": saved["saved"] - 900.0}))
+    assert StateFile(path, 3600.0).restore(after)
+    known = after.core["sample"]["bias_std"][0, :6]
+    start = before.core["settings"]["learned"][0, :6]
+    assert known == pytest.approx(np.hypot(start, 30.0 * np.array(walk)), rel=0.01)
