@@ -120,18 +120,43 @@ APART = 1e-3
 
 @compiled
 def cover_rivals(core: Core) -> None:
-    """Raise ``core.last.level`` to a bound that also holds if a name or the set is wrong."""
+    """Raise ``core.last.level`` to a bound that also holds if a name or the set is wrong.
+
+    A channel that has no value in this sample is no better named than before, so what it
+    raised the level by last is kept.
+    """
     now = core.now
     decision = core.decision
     n = core.settings.n
     fill_parity(now.parity, core.settings.sensors, now.fused, now.uncertainty)
     chi = chi_of(now.parity, n, now.fused, now.corrected)
-    for i in range(n):
-        if decision.faulty >> i & 1 and now.plain >> i & 1:
-            cover(core, 1 << i, chi)
-    doubted = decision.ambiguous
-    if doubted and not doubted & (now.fused | ~now.plain):
-        cover(core, doubted, chi)
+    level = core.last.level
+    for a in range(3):
+        now.uncovered[a] = now.covered[a] = level[a]
+    for i in range(n + 1):
+        out = decision.faulty & 1 << i if i < n else decision.ambiguous
+        raised = core.raised[i]
+        if out == 0:
+            for a in range(3):
+                raised[a] = 0.0
+        elif not out & (now.fused | ~now.plain):
+            for a in range(3):
+                level[a] = now.uncovered[a]
+            cover(core, out, chi)
+            for a in range(3):
+                raised[a] = level[a] - now.uncovered[a]
+        for a in range(3):
+            now.covered[a] = max(now.covered[a], now.uncovered[a] + raised[a])
+    for a in range(3):
+        level[a] = now.covered[a]
+
+
+@compiled
+def forget_rivals(core: Core) -> None:
+    """Forget what declared channels raised the level by, as none is declared."""
+    for i in range(core.settings.n + 1):
+        for a in range(3):
+            core.raised[i, a] = 0.0
 
 
 class Rival(NamedTuple):
@@ -290,3 +315,5 @@ def update_level(core: Core, subsets: NDArray[Any]) -> None:
             last.level[a] += abs(apart)
         if core.settings.risk > 0.0 and core.decision.faulty | core.decision.ambiguous:
             cover_rivals(core)
+    if core.decision.faulty | core.decision.ambiguous == 0:
+        forget_rivals(core)

@@ -660,6 +660,8 @@ class Current:
     lagging: Vector  # change of the rate up to the stated instant, rad/s
     plain_rate: Vector  # of the fused channels with expected weights, rad/s
     error_ratio: Channels  # error variance with the remaining bias, in noise_std^2
+    uncovered: Vector  # level without the rivals of the declared channels, rad/s
+    covered: Vector  # largest level with the rivals of one of them, rad/s
     guard: SampleVerdict  # of the estimator's own detector
     verdict: SampleVerdict  # of the method that declares
     scaled: Channels  # corrected values, residuals scaled to the expected noise, rad/s
@@ -702,6 +704,9 @@ class Core:
     group: Mask  # set that contains a faulty channel, after the last sample
     error: Channels  # estimated error at the start of the present state, rad/s
     wanted: Mask  # fused channels whose protection level must be calculated, or 0
+    # by how much each declared channel, and the set, raised the level of each axis when
+    # its values last came, rad/s
+    raised: Annotated[NDArray[np.float64], "f8", (MAX_CHANNELS + 1, 3)]
     last: OutputRow
     now: Current
     given: Sample  # the present sample, with values in the unit of the path

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from monitor.streams import config, mounted, parallel, told
+from monitor.streams import config, mounted, parallel, stream, told
 
 from fdi_ros.core.level import fill_level, passes_test
 from fdi_ros.core.subsets import prepare_subsets
@@ -437,3 +437,13 @@ def test_beside_a_named_channel_the_level_holds_if_others_are_faulty_instead(
     ratio = output.level[-1] / level
     assert ratio.min() == pytest.approx(1.0, rel=1e-6)
     assert ratio.max() < 1.0 + 1e-6 if whole else ratio.max() < 1.8
+
+
+def test_a_declared_channel_that_loses_a_value_does_not_lower_the_level():
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    block = stream(pipeline.geometry, 1000, size=0.3)
+    block.z[400:, 4] += 0.1
+    block.z[700::10, 4] = np.nan
+    level = pipeline.process(block).level[699:, 1]
+    assert (level[1::10] > 0.9 * level[:-1:10]).all()
+    assert (level[1::10] < 1.1 * level[:-1:10]).all()
