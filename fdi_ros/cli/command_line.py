@@ -99,7 +99,9 @@ SHARED_ARGUMENTS: Mapping[str, Options] = {
     "--json": takes_path(
         "write all figures as JSON, in SI units; - writes to standard output, and tables to standard error"
     ),
-    "--force": takes("overwrite files that exist", action="store_true"),
+    "--force": takes(
+        "overwrite earlier results of fdi, and no other file", action="store_true"
+    ),
     "--quiet": takes("print errors only, and no progress", action="store_true"),
     "--degrees": takes(
         "print angular rates in deg/s; files stay in rad/s",
@@ -202,7 +204,7 @@ VERBS = {
                 metavar="DIR",
             ),
             **RESULT_ARGUMENTS,
-            "--force": takes("overwrite outputs that exist"),
+            "--force": takes("overwrite earlier results of fdi, and no other file"),
             "--degrees": {},
         },
         "replay:run_replay",

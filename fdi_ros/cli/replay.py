@@ -82,7 +82,7 @@ def run_replay(arguments: Namespace) -> int:
     summary = replayed[0].summary
     text = _replay_text(replayed[0])
     for beside in replayed[1:]:
-        text += f"\nbeside it: {_replay_text(beside)}"
+        text += f"\nthe other recording: {_replay_text(beside)}"
     severities = [one.summary.verdict.severity for one in replayed]
     worst = max(severities, key=list(Severity).index)
     outputs.finish(text, severity=severities[0])

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fdi_ros.compiling.compiled import MAX_CHANNELS
+from fdi_ros.config.unit_names import short_names
 from fdi_ros.errors import GeometryError
 from fdi_ros.model.samples import Array
 from fdi_ros.system.text import html_table, listed
@@ -348,12 +349,15 @@ def whole_units(geometry: Geometry, channels: Sequence[int]) -> list[str]:
     Empty if the set does not consist of whole units.
     """
     inside = [unit for unit in geometry.units if set(channels).issuperset(unit)]
-    whole = sum(map(len, inside)) == len(channels)
-    return (
-        [geometry.channel_names[unit[0]].rpartition(".")[0] for unit in inside]
-        if whole
-        else []
-    )
+    if sum(map(len, inside)) != len(channels):
+        return []
+    return [_unit_name([geometry.channel_names[i] for i in unit]) for unit in inside]
+
+
+def _unit_name(channels: Sequence[str]) -> str:
+    """Return the name of all channels of a unit: ``imu_1``, or ``imu_1.accel``."""
+    short = short_names(channels)
+    return short[0] if len(short) == 1 else channels[0].rpartition(".")[0]
 
 
 def one_of_words(geometry: Geometry, channels: Sequence[int]) -> str:

@@ -484,17 +484,13 @@ def _frozen_units(channel: ChannelStatus, status: Status) -> list[UnitStatus]:
 def _format_state(channel: ChannelStatus, status: Status) -> str:
     # ``since`` is 0 in the initial state of a channel.
     ago = max(0, status.stamp - channel.since) / 1e9
-    lasting = (
-        "since the start"
-        if not channel.since
-        else f"for {_seconds(ago)}"
-        if ago
-        else "now"
-    )
+    lasting = f", for {_seconds(ago)}" if ago else ""
+    if not channel.since:
+        lasting = ", since the start"
     if channel.state == ChannelState.OK:
         return "agrees with the others"
     if channel.state == ChannelState.AMBIGUOUS:
-        return f"{_format_set(channel, status)}, {lasting}"
+        return f"{_format_set(channel, status)}{lasting}"
     words = channel.reason.value or channel.state.name.lower()
     size = f"{_figure(abs(channel.error))} {channel.unit}" if channel.error else ""
     if channel.reason == Reason.DISAGREES and size:
@@ -506,9 +502,13 @@ def _format_state(channel: ChannelStatus, status: Status) -> str:
     ending = {
         ChannelState.SUSPECT: "suspected, left out for now",
         ChannelState.FAULTY: "isolated and left out",
-        ChannelState.UNCHECKED: "left out" if channel.is_left_out else "still used",
+        ChannelState.UNCHECKED: "still used"
+        if status.has_rate
+        else "no fused rate yet",
     }
-    return f"{words}, {lasting}; {ending.get(channel.state, 'left out')}"
+    if channel.is_left_out:
+        ending[ChannelState.UNCHECKED] = "left out"
+    return f"{words}{lasting}; {ending.get(channel.state, 'left out')}"
 
 
 def _format_set(channel: ChannelStatus, status: Status) -> str:
@@ -516,7 +516,7 @@ def _format_set(channel: ChannelStatus, status: Status) -> str:
     if pair is not None and set(pair.channels) == set(channel.group):
         return f"{pair}: one of the two is faulty, undecided"
     if len(channel.group) == 1:
-        return "probably faulty; confirmation pending"
+        return "probably faulty, to be confirmed"
     one_of = f"one of {', '.join(channel.group)} is faulty, undecided"
     return (_format_unit_set(channel.group, status.units) or one_of) + (
         f"; seen on {pair}" if pair else ""

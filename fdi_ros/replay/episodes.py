@@ -313,6 +313,8 @@ MOST_TOLD = 5
 """Episodes in the summary. The tables have all of them."""
 TOO_SMALL = "too small to measure"
 """Words for a size below its standard error."""
+LEAST_BEFORE = 0.05
+"""Time between the first sign and the declaration that is told, s. Words have tenths."""
 FEW_CHANNELS = 3
 """Largest set that is described channel by channel."""
 
@@ -337,10 +339,18 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     figure = f"{'-' if value < 0 else '+'}{figure}" if abs(value) > std else TOO_SMALL
     if size.course == "gone":
         return f"{figure}, until {size.gone_s:.3f} s"
-    if size.course == "steady":
+    if size.course == "steady" or is_too_small(size):
         return figure
     last = figures(size.last_rad_s * unit.factor, 3, "+")
     return f"{figure}, {course_word(size)} to {last} {unit.name}"
+
+
+def is_too_small(size: Size) -> bool:
+    """Whether an error stays below its standard error."""
+    if size.course not in ("steady", "growing", "shrinking"):
+        return False
+    last = 0.0 if size.course == "steady" else abs(size.last_rad_s)
+    return max(abs(size.rad_s), last) <= size.std_rad_s
 
 
 def course_word(size: Size) -> str:
@@ -382,6 +392,8 @@ def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
     until = "" if one.stands else f" to {one.end_s:.3f} s"
     about = _about(one, unit)
     before = _before(one)
+    if not before and one.since_s - one.start_s >= LEAST_BEFORE:
+        before = f"suspected from {one.start_s:.3f} s"
     if one.apart is not None:
         where = (
             ""
@@ -404,11 +416,10 @@ def _about(one: Episode, unit: Unit) -> str:
             rad_s=abs(one.apart.size.rad_s),
             last_rad_s=abs(one.apart.size.last_rad_s),
         )
-        return (
-            size_words(apart, unit)
-            .removeprefix("+")
-            .replace(unit.name, f"{unit.name} apart", 1)
-        )
+        words = size_words(apart, unit).removeprefix("+")
+        if words.endswith(" rms"):
+            return f"{words} apart"
+        return words.replace(unit.name, f"{unit.name} apart", 1)
     sizes = [
         (candidate.channel, size_words(candidate.size, unit))
         for candidate in one.candidates
@@ -502,7 +513,7 @@ def detail_words(
 def _growth(one: Candidate, unit: Unit) -> str:
     """Describe the growth of an error. Empty: the error neither grows nor shrinks."""
     size = one.size
-    if size is None or not size.slope_rad_s2:
+    if size is None or not size.slope_rad_s2 or is_too_small(size):
         return ""
     first, last, slope = (
         figures(value * unit.factor, 3, "+")

@@ -147,8 +147,8 @@ class FailoverReplay(Sink):
         shift = 0 if origin is None or self._first is None else self._first - origin
         done = [f"{one.words} at {(one.at + shift) / NS:.1f} s" for one in self._done]
         least = self._settings.min_size
-        none = f"no IMU out of use (it acts from {least:g} rad/s on)"
-        return f"failover, if armed: {'; '.join(done) or none}"
+        none = f"no IMU out of use (it acts on errors of {least:g} rad/s and more)"
+        return f"what failover would have done if armed: {'; '.join(done) or none}"
 
 
 def is_possible(channels: Sequence[str]) -> bool:

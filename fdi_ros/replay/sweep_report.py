@@ -259,8 +259,8 @@ MOVES = 0.1
 def smallest_hint(plan: Plan) -> str:
     """Explain the smallest sizes and the figures in brackets."""
     return (
-        f"smallest size of which at least {WANTED:.0%} of the faults were detected within"
-        f" {plan.within:g} s; in brackets: detected, tried, 95 % interval"
+        f"From this size on, at least {WANTED:.0%} of the faults were detected (or isolated) within"
+        f" {plan.within:g} s. In brackets: how many of those tried, and the 95 % interval of the share."
     )
 
 
@@ -293,9 +293,7 @@ def sound_lines(tried: Subject) -> list[str]:
     baseline = tried.baseline
     if baseline is None or tried.refused:
         return [f"not tried: {tried.refused}"]
-    words = (
-        f"without injected faults, nothing was declared in {baseline.duration:.1f} s"
-    )
+    words = f"nothing was declared in {baseline.duration:.1f} s"
     lines = [
         f"{words} ({baseline.judged:.0%} of the samples judged, from {baseline.begins:.1f} s on)"
     ]
@@ -306,9 +304,7 @@ def sound_lines(tried: Subject) -> list[str]:
             else ""
         )
         doubt = "The recording contains a fault, or the config does not fit: the figures below are unreliable"
-        lines = [
-            f"declared without injected faults: {episode_words(told[0])}{more}. {doubt}"
-        ]
+        lines = [f"declared: {episode_words(told[0])}{more}. {doubt}"]
     if tried.skipped:
         at = ", ".join(f"{time:.1f} s" for time in tried.skipped)
         why = "a channel is already declared there, or gives no data"
@@ -349,9 +345,7 @@ def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
     # At rest smaller faults are found than in flight.
     moving = sum(speed > MOVES for speed in tried.speeds)
     times = len(tried.times)
-    motion = (
-        f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of {times} times"
-    )
+    motion = f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of the {times} start times"
     rest = ": the vehicle was mostly AT REST; in flight the figures are worse (choose a part with --start, --end)"
     return [*words, motion if 2 * moving >= times else motion + rest]
 
@@ -367,7 +361,7 @@ def _from(lines: Sequence[Line], named: bool) -> str:
     return (
         f"from {size} {of}"
         if found
-        else f"not even at {size}, the largest size tried {of}"
+        else f"less often, even at {size}, the largest size tried {of}"
     )
 
 
@@ -381,9 +375,9 @@ def _in_short(line: Line) -> str:
 
 HINTS = [
     "isolated: only the faulty channel was declared; detected: isolated, or declared in a set with others",
-    "delay: from the start of a fault to its detection; a dash: fewer than half (or 95 %) were detected",
-    "a stuck value or a scale error is visible only while the vehicle turns; noise mostly gives a warning only",
-    "these figures are for one recording: a flight with more vibration may need larger faults",
+    "delay: from the start of a fault to its detection; a dash: fewer than half (last column: 95 %) were detected",
+    "a stuck value or a scale error shows only while the vehicle turns; noise is reported, but mostly not declared",
+    "these figures hold for this recording: a flight with more vibration may need larger faults",
 ]
 
 
@@ -406,7 +400,7 @@ def sweep_text(results: Sequence[Subject], plan: Plan, bag: str) -> str:
 def _as_they_are(results: Sequence[Subject], plan: Plan) -> list[Section]:
     """Lay out each monitor without faults, and all side by side with faults."""
     sections = [
-        Section(f"{one.name}, nothing injected", "", sound_lines(one))
+        Section(f"{one.name}, without injected faults", "", sound_lines(one))
         for one in results
     ]
     lines = {
@@ -456,7 +450,9 @@ def _summary(results: Sequence[Subject], plan: Plan) -> list[str]:
     lines = []
     for one in results:
         before = f"{one.name}: " if len(results) > 1 else ""
-        lines += [f"{before}nothing injected: {line}." for line in sound_lines(one)[:1]]
+        lines += [
+            f"{before}without injected faults, {line}." for line in sound_lines(one)[:1]
+        ]
         verdict = verdict_lines(one, plan)
         # With several monitors the table side by side has these figures.
         lines += [
@@ -465,7 +461,7 @@ def _summary(results: Sequence[Subject], plan: Plan) -> list[str]:
                 verdict if len(results) == 1 else [*verdict[:1], *verdict[-2:]]
             )
         ]
-    return [*lines[:1], f"{smallest_hint(plan)}:", *lines[1:]]
+    return [*lines[:1], smallest_hint(plan), *lines[1:]]
 
 
 def _curves(tried: Sequence[Subject], plan: Plan) -> list[Section]:

@@ -151,19 +151,32 @@ def told(columns: Iterable[Column], unit: Unit = RADIANS) -> Rows:
     ), list(zip(*cells, strict=True))
 
 
+LONGEST_FIGURE = 24
+"""Characters of the longest figure with its error and unit. A longer cell is a text."""
+
+
 def table(
     head: Sequence[str], rows: Iterable[Sequence[str]], figures: bool = True
 ) -> list[str]:
     """Lay out lines of text in columns, with control characters escaped.
 
-    ``figures``: the columns after the first hold figures and are aligned to the right. Otherwise all
-    columns are aligned to the left, and long texts are shortened.
+    ``figures``: the columns after the first hold figures and are aligned to the right, but for those
+    with a cell longer than `LONGEST_FIGURE`. Otherwise all columns are aligned to the left, and long
+    texts are shortened.
     """
     most = LINE if figures else WORD
     lines = [tuple(head), *(tuple(shown(cell, most) for cell in row) for row in rows)]
     width = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    longest = [
+        max(map(len, column), default=0) for column in zip(*lines[1:], strict=True)
+    ]
+    right = [
+        figures and k > 0 and long <= LONGEST_FIGURE
+        for k, long in enumerate(longest or width)
+    ]
     form = "  ".join(
-        f"{{:{'>' if figures and k else '<'}{wide}}}" for k, wide in enumerate(width)
+        f"{{:{'>' if to_right else '<'}{wide}}}"
+        for wide, to_right in zip(width, right, strict=True)
     )
     return [form.format(*line).rstrip() for line in lines]
 
@@ -183,7 +196,8 @@ def number(value: float | None, form: str = ".3f", unit: str = "") -> str:
 
 def milliseconds(seconds: float | None) -> str:
     """Return a time, s, in ms, or a dash."""
-    return "-" if seconds is None else f"{1000 * seconds:.1f} ms"
+    # The sum turns a rounded -0.0 into 0.0.
+    return "-" if seconds is None else f"{round(1000 * seconds, 1) + 0.0:.1f} ms"
 
 
 PALETTE = (

@@ -113,6 +113,12 @@ def figures(value: float, digits: int = 3, sign: str = "") -> str:
     return f"{value:{sign}.0f}" if "e+" in text else text
 
 
+def span(low: float, high: float, form: str) -> str:
+    """Write a range, or one number if both ends read alike: ``28 to 35``."""
+    first, last = f"{low:{form}}", f"{high:{form}}"
+    return first if first == last else f"{first} to {last}"
+
+
 def plus_minus(value: float, std: float) -> str:
     """Write a value with its standard error, rounded to the error: `0.10 +- 0.03`."""
     if not math.isfinite(std) or std <= 0.0:

@@ -14,7 +14,12 @@ from replay.summaries import summary_of
 
 from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.faults.fault import Injector, parse_fault
-from fdi_ros.model.geometry import Geometry, one_of_words, spans_space
+from fdi_ros.model.geometry import (
+    Geometry,
+    all_of_words,
+    one_of_words,
+    spans_space,
+)
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Event, Output
@@ -221,6 +226,11 @@ def test_a_pair_that_measures_one_axis_is_named_by_it_with_how_far_it_is_apart()
     turned = Geometry.from_triads([np.eye(3), [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]])
     assert one_of_words(turned, [0, 4]) == "imu_1.x or imu_2.y, which measure one axis,"
     assert one_of_words(turned, [3, 4, 5]) == "any axis of imu_2"
+    forces = Geometry(
+        turned.axes, [name.replace(".", ".accel_") for name in turned.channel_names]
+    )
+    assert one_of_words(forces, [3, 4, 5]) == "any axis of imu_2.accel"
+    assert all_of_words(forces, [0, 1, 2]) == "imu_1.accel"
     assert one_of_words(turned, [0, 1]) == "imu_1.x or imu_1.y"
 
 
@@ -274,6 +284,8 @@ def test_units_that_begin_one_after_the_other_were_not_silent():
 def test_a_size_has_its_sign_and_one_below_its_error_is_none():
     assert size_words(Size(-0.2, 0.01, "steady", -0.2)) == "-0.200 +- 0.010 rad/s"
     assert size_words(Size(-0.009, 0.01, "steady", -0.2)) == "too small to measure"
+    drift = Size(-0.002, 0.01, "growing", -0.009, slope_rad_s2=-0.006)
+    assert size_words(drift) == "too small to measure"
     assert (
         size_words(Size(0.009, 0.01, "growing", 0.2))
         == "too small to measure, growing to +0.2 rad/s"

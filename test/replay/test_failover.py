@@ -41,7 +41,8 @@ def test_a_healthy_recording_has_no_order():
     replay = FailoverReplay(NAMES, CONFIG.sample_rate)
     Walk(Pipeline(CONFIG), [replay]).take(Block(INTERVAL * np.arange(4000), recorded()))
     assert replay.text() == (
-        "failover, if armed: no IMU out of use (it acts from 0.03 rad/s on)"
+        "what failover would have done if armed: no IMU out of use"
+        " (it acts on errors of 0.03 rad/s and more)"
     )
 
 

@@ -161,12 +161,12 @@ def test_what_is_declared_without_a_fault_comes_first_and_is_left_out():
     assert all(time < 40 for time in tried.times)
     assert [time > 38 for time in tried.skipped] == [True] * len(tried.skipped) != []
     words = sound_lines(tried)
-    assert words[0].startswith("declared without injected faults: g3 FAULTY from 40.0")
+    assert words[0].startswith("declared: g3 FAULTY from 40.0")
     assert "unreliable" in words[0]
     page = sweep_page([tried], plan, "bag", {})
     text = sweep_text([tried], plan, "bag")
     for told in (page, text):
-        assert told.index("injected faults: g3 FAULTY") < told.index("bias 0.02 rad/s")
+        assert told.index("declared: g3 FAULTY") < told.index("bias 0.02 rad/s")
 
 
 def test_figures_of_a_vehicle_at_rest_are_called_that():
@@ -178,7 +178,7 @@ def test_figures_of_a_vehicle_at_rest_are_called_that():
         "bias: detected from 0.1 rad/s (12 of 12, 76% to 100%); isolated from 0.1 rad/s (12 of 12, 76%"
         in text
     )
-    assert "at 0 of 2 times: the vehicle was mostly AT REST" in text
+    assert "at 0 of the 2 start times: the vehicle was mostly AT REST" in text
     moving, plan = swept(flown(), "kind=bias size=0.1", within=1.0)
     assert "AT REST" not in sweep_page([moving], plan, "bag", {})
 
@@ -259,7 +259,7 @@ def test_excluded_channels_are_not_tried(fdi, tmp_path):
     assert {abs(float(row["size"])) for row in rows} == {0.3}
     delays = sorted(float(row["named_after_s"]) for row in rows[:12])
     assert delays[5] == pytest.approx(fault["named_after_s"]["median"], abs=1e-6)
-    assert outputs[2].read_text().index("nothing injected") < outputs[
+    assert outputs[2].read_text().index("without injected faults") < outputs[
         2
     ].read_text().index("Side by side")
 
