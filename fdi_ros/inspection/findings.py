@@ -47,8 +47,24 @@ class Finding(NamedTuple):
     bound: float | None = None
     #: first words of a verdict that this finding decides, one of `HEADLINES`, or empty
     headline: str = ""
+    #: what to do about it, without a full stop, or empty
+    advice: str = ""
+
+    @property
+    def line(self) -> str:
+        """The words, and what to do."""
+        if not self.advice:
+            return self.words
+        return f"{self.words.removesuffix('.')}. What to do: {self.advice}"
 
 
+LOOK = "USABLE, BUT LOOK"
+BESIDE_LOOKS = (
+    "NO BETTER THAN BEFORE",
+    "USABLE, NOT CALIBRATED",
+    "USABLE FOR LARGE FAULTS ONLY",
+)
+"""Headlines that a channel or unit worth a look may explain."""
 HEADLINES = {  # of verdicts, the first that is there decides
     "NEEDS": Severity.BAD,
     "NEEDS A LOOK": Severity.BAD,
@@ -56,7 +72,7 @@ HEADLINES = {  # of verdicts, the first that is there decides
     "NO BETTER THAN BEFORE": Severity.UNKNOWN,
     "USABLE, NOT CALIBRATED": Severity.UNKNOWN,
     "USABLE FOR LARGE FAULTS ONLY": Severity.UNKNOWN,
-    "USABLE, BUT LOOK": Severity.UNKNOWN,
+    LOOK: Severity.UNKNOWN,
     "READY, BUT LOOK": Severity.UNKNOWN,
     "USABLE": Severity.GOOD,
     "READY": Severity.GOOD,
@@ -65,19 +81,28 @@ HEADLINES = {  # of verdicts, the first that is there decides
 
 def lines_of(findings: Iterable[Finding], role: Role) -> list[str]:
     """Return the lines of one kind."""
-    return [shown(one.words, LINE) for one in findings if one.role is role]
+    return [shown(one.line, LINE) for one in findings if one.role is role]
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
     """Return the verdict: the first of `HEADLINES` in use, with all its findings."""
-    words: dict[str, list[str]] = {}
+    by_headline: dict[str, list[Finding]] = {}
     for one in findings:
-        words.setdefault(one.headline, []).append(one.words)
-    headline = next(headline for headline in HEADLINES if headline in words)
+        by_headline.setdefault(one.headline, []).append(one)
+    headline = next(headline for headline in HEADLINES if headline in by_headline)
+    deciding = by_headline[headline]
     between = " " if headline == "NEEDS" else ": "
-    return Verdict(
-        HEADLINES[headline], f"{headline}{between}{'; '.join(words[headline])}"
-    )
+    words = f"{headline}{between}{'; '.join(one.words for one in deciding)}"
+    if headline in BESIDE_LOOKS and LOOK in by_headline:
+        # They may be the cause.
+        looks = by_headline[LOOK]
+        deciding = [*deciding, *looks]
+        words = (
+            f"{words.removesuffix('.')}. Also: {'; '.join(one.words for one in looks)}"
+        )
+    if advice := dict.fromkeys(one.advice for one in deciding if one.advice):
+        words = f"{words.removesuffix('.')}. What to do: {'; '.join(advice)}"
+    return Verdict(HEADLINES[headline], words)
 
 
 def findings_figures(findings: Sequence[Finding]) -> dict[str, object]:

@@ -26,11 +26,11 @@ from fdi_ros.inspection.topics import (
     troubles,
 )
 from fdi_ros.model.geometry import MIN_CHANNELS
-from fdi_ros.model.noise import noisier_words
+from fdi_ros.model.noise import much_noisier, noisier_words
 from fdi_ros.model.samples import LARGEST_GYRO_RANGE
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
-from fdi_ros.monitor.soundness import LEAST_DELIVERED
+from fdi_ros.monitor.soundness import LEAST_DELIVERED, Trouble
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.system.text import LINE, figures, first_of, listed, shown
 
@@ -46,6 +46,8 @@ _PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
 MOST_DISORDERED = 0.1
 #: share of the values of a gyro that are repeated for long, from which on to look
 MUCH_FROZEN = 0.1
+#: the same, from which on most of what a unit sends measures nothing
+MOSTLY_FROZEN = 0.5
 NEEDED = ", or ".join(
     f"two {kind.type.rpartition('/')[2]} topics"
     if kind.stamped
@@ -295,30 +297,31 @@ def recording_findings(
             f"{copies}; the copy is left out",
             headline="NEEDS A LOOK",
         )
-    looks = [
-        *(("left out", *one) for one in unused_topics(reports, unread)),
-        *(("delivered", *one) for one in _slow_topics(chosen)),
-    ]
-    for what, topic, words in looks:
-        yield _look(what, words, (topic,))
-    yield from _bad_values(chosen)
+    for topic, words in unused_topics(reports, unread):
+        yield _look("left out", words, Trouble.LEFT_OUT, (topic,))
+    for topic, words in _slow_topics(chosen):
+        yield _look("delivered", words, Trouble.DELIVERY, (topic,))
+    yield from bad_values(chosen)
     units = len(chosen) > 1
     names = [
         f"{shown(one.topic.name)} {place}" for one in chosen for place in one.places
     ]
-    groups = np.split(
-        np.arange(len(names)),
-        np.cumsum([one.channels for one in chosen])[:-1] if units else len(names),
-    )
+    groups = [
+        group.tolist()
+        for group in np.split(
+            np.arange(len(names)),
+            np.cumsum([one.channels for one in chosen])[:-1] if units else len(names),
+        )
+    ]
     words = (
         f"{len(names)} channels in {f'{len(chosen)} units' if units else 'one array'}"
     )
     words += f" at {figures(max(one.rate for one in chosen))} Hz can be judged"
     noise = np.concatenate([one.segments.noise().moving for one in chosen])
-    if noisy := noisier_words(
-        names, noise, [group.tolist() for group in groups], unit.name, unit.factor
-    ):
-        yield _look("noise", f"{noisy} from sample to sample; {words}")
+    if noisy := much_noisier(noise, groups):
+        who = dict.fromkeys(names[i].partition(" ")[0] for i, _ in noisy)
+        more = noisier_words(names, noise, groups, unit.name, unit.factor)
+        yield _look("noise", f"{more} from sample to sample", Trouble.NOISE, list(who))
     yield Finding(Role.WORTH, "ready", words, headline="READY")
     yield from topic_findings(chosen, unit)
 
@@ -347,7 +350,9 @@ def _slow_topics(chosen: Sequence[TopicReport]) -> Iterator[tuple[str, str]]:
             yield name, f"{shown(name)} delivered {share:.0f} % of its messages"
 
 
-def _bad_values(chosen: Sequence[TopicReport]) -> Iterator[Finding]:
+def bad_values(
+    chosen: Sequence[TopicReport], headline: str = "READY, BUT LOOK"
+) -> Iterator[Finding]:
     """Yield gyros at the end of their range, and gyros that repeat one value for long."""
     saturated = [
         f"{shown(one.topic.name)} {place}"
@@ -359,8 +364,9 @@ def _bad_values(chosen: Sequence[TopicReport]) -> Iterator[Finding]:
         seconds = max(
             float(one.values.saturated.max()) * one.interval for one in chosen
         )
-        words = f"{listed(saturated)} measured the end of the range for {figures(seconds, 2)} s"
-        yield _look("end of range", words)
+        words = f"{listed(saturated)} reached the end of the range for {figures(seconds, 2)} s"
+        units = dict.fromkeys(name.partition(" ")[0] for name in saturated)
+        yield _look("end of range", words, Trouble.END_OF_RANGE, list(units), headline)
     shares = {
         shown(one.topic.name): float(one.repeats.count.max()) / one.received
         for one in chosen
@@ -369,12 +375,39 @@ def _bad_values(chosen: Sequence[TopicReport]) -> Iterator[Finding]:
     if frozen and not saturated:
         share = max(shares[name] for name in frozen)
         words = f"{listed(frozen)} repeat one value for long, in {share:.0%} of the messages"
-        yield _look("frozen", words)
+        yield _look("frozen", words, Trouble.REPEATS, frozen, headline)
 
 
-def _look(what: str, words: str, who: Sequence[str] = ()) -> Finding:
+def frozen_words(chosen: Sequence[TopicReport]) -> str:
+    """Name the units that mostly repeat one value while another one does not, may be empty.
+
+    At rest, coarse values repeat too, but then in all units.
+    """
+    shares = {
+        shown(one.topic.name): float(one.repeats.count.min()) / one.received
+        for one in chosen
+    }
+    frozen = [name for name, share in shares.items() if share >= MOSTLY_FROZEN]
+    if not frozen or min(shares.values()) >= MUCH_FROZEN:
+        return ""
+    share = max(shares[name] for name in frozen)
+    verb = "repeats" if len(frozen) == 1 else "repeat"
+    return (
+        f"{listed(frozen)} {verb} one value for long, in {share:.0%} of the messages, and the other"
+        " units do not"
+    )
+
+
+def _look(
+    what: str,
+    words: str,
+    trouble: Trouble,
+    who: Sequence[str],
+    headline: str = "READY, BUT LOOK",
+) -> Finding:
     """Return a finding that asks for a look at a recording that can be judged."""
-    return Finding(Role.WARNING, what, words, who, headline="READY, BUT LOOK")
+    advice = trouble.advice(who)
+    return Finding(Role.WARNING, what, words, who, headline=headline, advice=advice)
 
 
 def topic_findings(

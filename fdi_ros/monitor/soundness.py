@@ -21,7 +21,7 @@ from fdi_ros.config.unit_names import short_names
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.noise import much_noisier
 from fdi_ros.model.samples import Array
-from fdi_ros.system.text import figures, listed
+from fdi_ros.system.text import LINE, figures, listed, shown
 
 if TYPE_CHECKING:
     from fdi_ros.monitor.status import ChannelStatus, Status
@@ -131,21 +131,47 @@ class RateHealth:
     """Share of the samples with a fused rate."""
 
 
+class Trouble(Enum):
+    """Kind of a concern. The value is what to do about it, with ``{who}`` for the units."""
+
+    UNCHECKED = (
+        "judge only the part in flight (--start, --end), or record again, with rest at the start and"
+        " less vibration"
+    )
+    LEFT_OUT = (
+        "to judge {who}, name the topic in a config (--config), or mend its messages"
+    )
+    DELIVERY = "check connection, driver and bus load of {who}"
+    COPY = "give {who} a sensor of its own: check wiring and driver"
+    DOUBT = "make a longer recording: the suspicion of {who} is still open"
+    END_OF_RANGE = "choose a larger range for {who}"
+    NO_RATE = "see in the report (--report) what the channels did meanwhile"
+    SPIKES = "check wiring and power supply of {who}"
+    NOISE = "check {who} for a loose mounting"
+    REPEATS = (
+        "check the driver of {who} if the vehicle moved meanwhile; coarse values repeat at rest, so"
+        " judge only the part in flight (--start, --end)"
+    )
+
+    def advice(self, who: Iterable[str]) -> str:
+        """Return what to do. ``who``: channels, units or topics."""
+        units = dict.fromkeys(name.rpartition(".")[0] or name for name in who)
+        return self.value.format(who=listed([shown(name, LINE) for name in units]))
+
+
 class Concern(NamedTuple):
     """One reason not to call channels healthy."""
 
     word: Word
     """The verdict it leads to: LOOK or CANNOT TELL."""
+    trouble: Trouble
+    """Its kind."""
     who: tuple[str, ...]
     """Channels, units or topics, or the fused rate."""
     words: str
     """What is wrong, as it continues the names: ``has 24 spikes``."""
     joined_by: str = "and"
     """``or``: about one of the names, and which one is not known."""
-    is_noise: bool = False
-    """Whether it is about noise."""
-    is_delivery: bool = False
-    """Whether it is about messages that a unit did not deliver."""
 
     def __str__(self) -> str:
         return f"{listed(short_names(self.who), self.joined_by)} {self.words}"
@@ -155,6 +181,19 @@ class Concern(NamedTuple):
         """The concern as a sentence. Names of channels keep their small letters."""
         words = f"{self}."
         return f"T{words[1:]}" if words.startswith("the ") else words
+
+    @property
+    def advice(self) -> str:
+        """What to do about it."""
+        return self.trouble.advice(self.who)
+
+
+def advice_on(concerns: Iterable[Concern]) -> str:
+    """Return what to do about some concerns, each kind of trouble once."""
+    by_trouble: dict[Trouble, list[str]] = {}
+    for one in concerns:
+        by_trouble.setdefault(one.trouble, []).extend(one.who)
+    return "; ".join(trouble.advice(who) for trouble, who in by_trouble.items())
 
 
 PASSES = 20
@@ -232,19 +271,24 @@ def concerns_of(
         *_alike(
             [one for one in channels if one.checked < LEAST_CHECKED],
             Word.CANNOT_TELL,
+            Trouble.UNCHECKED,
             lambda some: (
                 "could be checked in only"
                 f" {100 * min(one.checked for one in some):.0f} % of the samples"
             ),
         ),
-        *(Concern(Word.LOOK, (topic,), f"is left out: {why}") for topic, why in unused),
         *(
-            Concern(Word.LOOK, (unit.name,), _slow_words(unit), is_delivery=True)
+            Concern(Word.LOOK, Trouble.LEFT_OUT, (topic,), f"is left out: {why}")
+            for topic, why in unused
+        ),
+        *(
+            Concern(Word.LOOK, Trouble.DELIVERY, (unit.name,), _slow_words(unit))
             for unit in slow
         ),
         *(
             Concern(
                 Word.LOOK,
+                Trouble.COPY,
                 (unit.name,),
                 f"repeats the values of {unit.copy_of}: one sensor, no redundancy",
             )
@@ -254,6 +298,7 @@ def concerns_of(
         *_alike(
             [one for one in alone if one.delivered < LEAST_DELIVERED],
             Word.LOOK,
+            Trouble.DELIVERY,
             lambda some: (
                 "gave a value in only"
                 f" {100 * min(one.delivered for one in some):.0f} % of the samples"
@@ -263,14 +308,20 @@ def concerns_of(
         *_alike(
             [one for one in channels if one.saturated_s > 0.0],
             Word.LOOK,
+            Trouble.END_OF_RANGE,
             lambda some: (
-                "measured the end of the range for"
+                "reached the end of the range for"
                 f" {figures(max(one.saturated_s for one in some), 2)} s"
             ),
         ),
         *_rate_concerns(rate),
         *(
-            Concern(Word.LOOK, (one.name,), f"has {one.spikes} spikes of one sample")
+            Concern(
+                Word.LOOK,
+                Trouble.SPIKES,
+                (one.name,),
+                f"has {one.spikes} spikes of one sample",
+            )
             for one in channels
             if one.spikes >= LEAST_SPIKES
         ),
@@ -317,7 +368,7 @@ def _rate_concerns(rate: RateHealth | None) -> list[Concern]:
     since = rate.missing_from_s
     when = "" if since is None else f", for the first time at {since:.1f} s"
     words = f"was not published for {figures(rate.missing_s)} s{when}"
-    return [Concern(word, ("the fused rate",), words)]
+    return [Concern(word, Trouble.NO_RATE, ("the fused rate",), words)]
 
 
 def _is_slow(unit: UnitHealth) -> bool:
@@ -338,12 +389,13 @@ def _slow_words(unit: UnitHealth) -> str:
 def _alike(
     some: Sequence[ChannelHealth],
     word: Word,
+    trouble: Trouble,
     words: Callable[[Sequence[ChannelHealth]], str],
 ) -> list[Concern]:
     """Return one concern about all of some channels, or none."""
     if not some:
         return []
-    return [Concern(word, tuple(one.name for one in some), words(some))]
+    return [Concern(word, trouble, tuple(one.name for one in some), words(some))]
 
 
 def _doubts(some: Sequence[ChannelHealth]) -> list[Concern]:
@@ -352,7 +404,8 @@ def _doubts(some: Sequence[ChannelHealth]) -> list[Concern]:
     for one in some:
         by_words.setdefault(one.doubt, []).append(one.name)
     return [
-        Concern(Word.LOOK, tuple(names), words) for words, names in by_words.items()
+        Concern(Word.LOOK, Trouble.DOUBT, tuple(names), words)
+        for words, names in by_words.items()
     ]
 
 
@@ -369,9 +422,9 @@ def _noise_concerns(channels: Sequence[ChannelHealth]) -> list[Concern]:
     lasting = [
         Concern(
             Word.LOOK,
+            Trouble.NOISE,
             tuple(one.name for one in own),
             _lasting_noise_words(own, max(ratios[one.name] for one in own)),
-            is_noise=True,
         )
         for own in by_unit.values()
     ]
@@ -413,7 +466,7 @@ def _noisy_for_a_time(channels: Sequence[ChannelHealth]) -> list[Concern]:
         names = tuple(one.name for one in channels if one in same)
         several = len({one.unit for one in same}) > 1
         joined_by = "or" if several else "and"
-        found.append(Concern(Word.LOOK, names, words, joined_by, is_noise=True))
+        found.append(Concern(Word.LOOK, Trouble.NOISE, names, words, joined_by))
     return found
 
 

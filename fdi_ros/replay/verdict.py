@@ -12,13 +12,15 @@ import math
 from collections.abc import Collection, Sequence
 
 from fdi_ros.core.states import Reason
-from fdi_ros.monitor.soundness import Concern, Word, word_of
+from fdi_ros.monitor.soundness import Concern, Trouble, Word, advice_on, word_of
 from fdi_ros.replay.episodes import (
+    LEAST_BEFORE,
     MOST_TOLD,
     Episode,
     Size,
     course_word,
     is_factor,
+    is_too_small,
     true_quantity,
     unit_for,
 )
@@ -47,7 +49,8 @@ def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
             tuple(names),
         )
     if why := unjudged_words(judgement):
-        return ReplayVerdict(Word.CANNOT_TELL.value, f"CANNOT TELL: {why}.", ())
+        sentence = f"CANNOT TELL: {why}. What to do: {_to_judge(judgement)}."
+        return ReplayVerdict(Word.CANNOT_TELL.value, sentence, ())
     concerns = judgement.concerns
     word = word_of(concerns)
     deciding = [one for one in concerns if one.word is word]
@@ -57,7 +60,8 @@ def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
         sentence = _healthy_words(judgement)
     else:
         listed_ones = first_of(list(map(str, deciding)), MOST_CONCERNS, "; ")
-        sentence = f"no fault was found in {seconds:.1f} s, but {listed_ones}"
+        sentence = f"no fault was found in {seconds:.1f} s, but {listed_ones}."
+        sentence += f" What to do: {advice_on(deciding)}"
     return ReplayVerdict(word.value, f"{word.value}: {sentence}.", tuple(names))
 
 
@@ -115,6 +119,23 @@ def unjudged_words(judgement: Judgement) -> str:
             " start: perhaps a fault before the recording"
         )
     return ""
+
+
+def _to_judge(judgement: Judgement) -> str:
+    """Return what to do about a recording that was not judged as a whole."""
+    bias = judgement.monitor.bias
+    if bias.far:
+        return (
+            f"check {listed(bias.far)}, or set bias.turn_on_std if such a bias is usual"
+        )
+    if bias.state == "learning":
+        return "record for longer, with some seconds of rest at the start"
+    frozen = [
+        one.name
+        for one in judgement.monitor.channels
+        if one.reason == Reason.FROZEN.value
+    ]
+    return Trouble.REPEATS.advice(frozen) if frozen else Trouble.UNCHECKED.value
 
 
 def wrongly_named(judgement: Judgement) -> list[str]:
@@ -186,7 +207,7 @@ def _faulty_sentences(
             *_size_sentences(first, unit),
             *_reason_sentences(first),
         ]
-    if first.since_s - first.start_s >= 0.05:
+    if first.since_s - first.start_s >= LEAST_BEFORE:
         sentences.append(f"First seen at {first.start_s:.1f} s.")
     others = dict.fromkeys(one.who for one in faulty[1:] if one.who != first.who)
     if others:
@@ -241,7 +262,7 @@ def noise_behind(judgement: Judgement) -> list[Concern]:
         return []
     if not all(one.declares for one in faulty):
         return []
-    return [one for one in judgement.concerns if one.is_noise]
+    return [one for one in judgement.concerns if one.trouble is Trouble.NOISE]
 
 
 def _frozen_unit(judgement: Judgement, one: Episode) -> str:
@@ -281,8 +302,8 @@ def _who(one: Episode) -> str:
         return one.who
     parts = [name.rpartition(".") for name in one.channels]
     units = {unit for unit, _, _ in parts}
-    if one.state == "AMBIGUOUS" and len(parts) > 1:
-        return _one_of(one)
+    if one.state == "AMBIGUOUS":
+        return _one_of(one) if len(parts) > 1 else f"{one.who} (not confirmed)"
     if one.state != "FAULTY" or len(parts) == 1 or len(units) > 1 or "" in units:
         return one.who.removesuffix(",")
     unit = parts[0][0]
@@ -309,8 +330,6 @@ def _when(one: Episode) -> str:
         since += brief or f" to {one.end_s:.1f} s"
     if one.state == "STALE":
         return f"gives no data {since}"
-    if one.state == "AMBIGUOUS" and len(one.channels) == 1:
-        return f"{since}, not confirmed"
     return since
 
 
@@ -359,7 +378,7 @@ def _size_words(size: Size, unit: Unit) -> str:
         return f"has noise of {value} {unit.name}"
     if size.course == "varying":
         return f"is off by a varying {value} {unit.name} rms"
-    if abs(size.rad_s) <= size.std_rad_s and size.course == "steady":
+    if is_too_small(size):
         return ""
     if size.course == "gone":
         return f"was off by {value} {unit.name} until {size.gone_s:.1f} s"

@@ -14,7 +14,7 @@ from fdi_ros.faults.fault import ACCELEROMETERS
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import UNUSED_COUNTERS
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
-from fdi_ros.monitor.soundness import Concern, UnitHealth, Word
+from fdi_ros.monitor.soundness import Concern, Trouble, UnitHealth, Word
 from fdi_ros.replay.episodes import (
     MOST_TOLD,
     Episode,
@@ -45,7 +45,7 @@ from fdi_ros.report.layout import (
     number,
     section_text,
 )
-from fdi_ros.system.text import figures, first_of, listed, shown
+from fdi_ros.system.text import figures, first_of, listed, shown, span
 
 AUTOPILOT_LOGS = (".bin", ".tlog")
 """Suffixes of the logs of ArduPilot."""
@@ -94,7 +94,7 @@ def _beside_silence(summary: Summary) -> list[Concern]:
     return [
         one
         for one in summary.concerns
-        if not (one.is_delivery and explained.issuperset(one.who))
+        if not (one.trouble is Trouble.DELIVERY and explained.issuperset(one.who))
     ]
 
 
@@ -119,10 +119,10 @@ def unchecked_words(channels: Sequence[ChannelResult]) -> str:
         since = sorted({one.since_s or 0.0 for one in group})
         if not since[-1]:
             when = "from the start"
-        elif len(since) > 1:
-            when = f"since {since[0]:.1f} to {since[-1]:.1f} s"
         else:
-            when = f"since {since[0]:.3f} s"
+            first, last = (f"{at:.1f} s" for at in (since[0], since[-1]))
+            when = f"from {first} on"
+            when += f", the last from {last} on" if last != first else ""
         names = listed(short_names([one.name for one in group]))
         words.append(f"{names} {state} {when}{f' ({reason})' if reason else ''}")
     return "; ".join(words)
@@ -163,11 +163,25 @@ def notes(summary: Summary) -> list[str]:
         )
         lines += [f"{topic}: {unused}"] if unused else []
     if missing := scores.samples - scores.samples_with_rate:
-        bias = summary.monitor.bias.state
-        state = "" if bias == "learned" else f" (start-up bias: {bias})"
-        lines.append(f"no fused rate in {missing} of {scores.samples} samples{state}")
+        lines.append(_rate_words(summary, missing))
     lines += stretch_words(summary.story)
-    return [*lines, summary.monitor.note] if summary.monitor.note else lines
+    if summary.monitor.note:
+        lines.append(f"at the end, {summary.monitor.note}")
+    return lines
+
+
+def _rate_words(summary: Summary, missing: int) -> str:
+    """Describe the samples without a fused rate: how many, and how many at the start."""
+    of = f"{missing} of {summary.scores.samples} samples"
+    bias = summary.monitor.bias.state
+    if bias != "learned":
+        why = "" if bias == "fixed" else f" (start-up bias: {bias})"
+        return f"no fused rate in {of}{why}"
+    # The rate counts as missing only from its first sample on.
+    later = summary.monitor.rate.missing_s
+    if not later:
+        return f"no fused rate in the first {of}, while the biases were learned"
+    return f"no fused rate in {of}, those at the start included, while the biases were learned"
 
 
 def sample_rate_notes(rate: SampleRate) -> list[str]:
@@ -301,8 +315,7 @@ def _temperature_words(unit: UnitHealth) -> str:
     """Return the range of the temperature of a unit. A dash: not logged."""
     if unit.temperature_c is None:
         return "-"
-    low, high = unit.temperature_c
-    return f"{low:.0f} to {high:.0f} °C"
+    return f"{span(*unit.temperature_c, '.0f')} °C"
 
 
 def _noise(channels: Sequence[ChannelResult], unit: Unit) -> float | None:

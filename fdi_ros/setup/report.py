@@ -14,16 +14,24 @@ import numpy as np
 
 from fdi_ros.core.sources import source_of
 from fdi_ros.inspection.findings import (
+    LOOK,
     Finding,
     Role,
     findings_figures,
     lines_of,
     verdict_of,
 )
-from fdi_ros.inspection.fitness import copy_words, topic_findings, unused_topics
+from fdi_ros.inspection.fitness import (
+    bad_values,
+    copy_words,
+    frozen_words,
+    topic_findings,
+    unused_topics,
+)
 from fdi_ros.inspection.topics import topic_columns
 from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array
+from fdi_ros.monitor.soundness import Trouble
 from fdi_ros.replay.sweep_report import declared_figures
 from fdi_ros.report.layout import (
     FORCES,
@@ -59,7 +67,7 @@ from fdi_ros.setup.run import (
     Tried,
     times_words,
 )
-from fdi_ros.system.text import LINE, figures, first_of, shown
+from fdi_ros.system.text import LINE, figures, first_of, listed, shown
 
 #: uncertainty of the axes along a direction of the body from which they are not well
 #: shown
@@ -139,13 +147,12 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     words += f" {(walk.value or walk.possible) * factor:.2g} {name} per sqrt(s)"
     yield Finding(Role.FOUND, "scale error", words, (), *result.scale)
     bent = found.nonlinearity
-    words = "nonlinearity not measured: turn faster, both ways about every axis"
     if bent.is_measured:
         size = f"{100 * bent.value:.2g} +- {100 * bent.error:.1g} %"
         if abs(bent.value) < bent.error:
             size = f"too small to measure, below {100 * bent.error:.1g} %"
         words = f"nonlinearity {size} of the largest rate"
-    yield Finding(Role.FOUND, "nonlinearity", words, (), bent.value, bent.error)
+        yield Finding(Role.FOUND, "nonlinearity", words, (), bent.value, bent.error)
     for delay in result.delays:
         names = [result.names[i] for i in delay.channels]
         words = f"{', '.join(names)}: {_delay_words(delay, 'imus.delays' in result.settings)}"
@@ -263,6 +270,9 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
             float(error[poor].max()),
             SHOWN_AXES,
         )
+    if not found.nonlinearity.is_measured:
+        words = "nonlinearity: not measured; turn faster, both ways about every axis"
+        yield Finding(Role.UNKNOWN, "nonlinearity", words)
     if late := [d for d in result.delays if d.error > SHOWN_DELAY]:
         names = list(
             dict.fromkeys(result.names[d.channels[0]].rpartition(".")[0] for d in late)
@@ -319,7 +329,7 @@ def _unknown_forces(fit: AccelerometerFit) -> Iterator[Finding]:
     """Yield what the recording does not show of the accelerometers."""
     error = fit.axis_errors
     if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:
-        words = f"accelerometers: scale factors and misalignments along {' and '.join(unmeasured)}: not"
+        words = f"accelerometers: scale factors and misalignments along {listed(unmeasured)}: not"
         words += " measured (gravity keeps its direction, or vibration hides it); a bias there may be a scale"
         words += " error. Lay the vehicle on each of its six sides for some seconds"
         yield Finding(
@@ -331,8 +341,8 @@ def _unknown_forces(fit: AccelerometerFit) -> Iterator[Finding]:
             float(error.max()),
             UNMEASURED,
         )
-    words = "accelerometers: a bias, scale error or misalignment that all have in common is not seen: none"
-    words += " contradicts it"
+    words = "accelerometers: a bias, scale error or misalignment that all have in common is not seen, because"
+    words += " they agree"
     yield Finding(Role.UNKNOWN, "common accelerometer error", words)
 
 
@@ -376,6 +386,7 @@ def _declared(faults: Sequence[Span], names: Sequence[str]) -> Finding:
         words,
         [names[i] for i in struck],
         headline="USABLE, BUT LOOK",
+        advice="replay the recording: its verdict says what to check",
     )
 
 
@@ -512,16 +523,26 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
         yield Finding(Role.WARNING, "copy", words, headline="USABLE, BUT LOOK")
     for topic, words in unused_topics(found.reports, found.unread):
         yield Finding(
-            Role.WARNING, "left out", words, (topic,), headline="USABLE, BUT LOOK"
+            Role.WARNING,
+            "left out",
+            words,
+            (topic,),
+            headline="USABLE, BUT LOOK",
+            advice=Trouble.LEFT_OUT.advice([topic]),
         )
+    yield from bad_values(found.chosen, LOOK)
     yield from topic_findings(found.chosen, unit)
     tried = found.proof.before if found.kept else found.proof.after
     if tried.baseline is not None:
         # A replay with these settings would give the same reasons to look.
         for one in tried.baseline.judgement.concerns:
-            words = f"in {found.proof.source}, {one}"
             yield Finding(
-                Role.WARNING, "health", words, one.who, headline="USABLE, BUT LOOK"
+                Role.WARNING,
+                "health",
+                f"in {found.proof.source}, {one}",
+                one.who,
+                headline="USABLE, BUT LOOK",
+                advice=one.advice,
             )
     limits = [
         line
@@ -545,6 +566,14 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
             f"the axes of the array are unknown (a cone is assumed): {found.refused}"
         )
         yield Finding(warning, "axes", words, headline="DO NOT USE")
+    elif words := frozen_words(found.chosen):
+        yield Finding(
+            warning,
+            "frozen",
+            words,
+            headline="DO NOT USE",
+            advice="check driver and bus, and record again",
+        )
     elif tried.judged < LEAST_JUDGED:
         note = tried.note or "channels are missing"
         words = f"the monitor judges only {tried.judged:.0%} of the samples in the proof: {note}"
@@ -558,12 +587,10 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
             warning, "declared", words, list(tried.declared), headline="DO NOT USE"
         )
     elif found.kept:
-        written = "the file has the settings that were given"
+        written = "The file has the settings that were given"
         if found.chosen:
-            written = (
-                "the file has the mounts found, and all else as `fdi inspect` does"
-            )
-        words = f"in {proof.source} {found.kept}. So {written}; what is measured below is not used"
+            written = "The file has the measured mounts, and otherwise the settings of `fdi inspect`"
+        words = f"in {proof.source}, {found.kept}. {written}; the other figures below are not used"
         yield Finding(warning, "proof", words, headline="NO BETTER THAN BEFORE")
     else:
         yield _usable(found, tried, unit)
@@ -589,11 +616,24 @@ def _usable(found: SetupResult, tried: Tried, unit: Unit) -> Finding:
     words += f" {isolated} were isolated."
     named, of = tried.isolated[FLOOR]
     if named < LEAST_NAMED * of:
-        words += f" Of {of} with {FLOOR * unit.factor:.3g} {unit.name}, {named} were"
-        words += f" isolated, fewer than {LEAST_NAMED:.0%}: expect to isolate large faults only."
+        words += f" Of {of} with {FLOOR * unit.factor:.3g} {unit.name}, {named} were isolated"
+        largest, among = tried.isolated[SIZES[-1]]
+        if largest < LEAST_NAMED * among:
+            words += f", and of {among} with {high} {unit.name}, {largest}: a faulty gyro may be"
+            words += " detected without being identified."
+        else:
+            words += ": expect to identify the faulty gyro only of larger faults."
         headline = "USABLE FOR LARGE FAULTS ONLY"
         return Finding(
-            Role.WARNING, "proof", words, (), named, None, LEAST_NAMED * of, headline
+            Role.WARNING,
+            "proof",
+            words,
+            (),
+            named,
+            None,
+            LEAST_NAMED * of,
+            headline,
+            "reduce vibration, or record again with rest and turns about every axis",
         )
     return Finding(Role.WORTH, "proof", words, (), isolated, None, biases, "USABLE")
 

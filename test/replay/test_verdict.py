@@ -24,6 +24,7 @@ from fdi_ros.monitor.soundness import (
     RateHealth,
     UnitHealth,
     Word,
+    advice_on,
     concerns_of,
     own_noise,
     word_of,
@@ -62,7 +63,8 @@ needs_cases = pytest.mark.skipif(
         (
             CASES / "all_saturate_2000dps.csv",
             4,
-            r"LOOK: .*imu_0\.z, imu_1\.z and imu_2\.z measured the end of the range for 1\.8 s",
+            r"LOOK: .*imu_0\.z, imu_1\.z and imu_2\.z reached the end of the range for 1\.8 s; .* What to do:"
+            r" choose a larger range for imu_0, imu_1 and imu_2;",
         ),
         (
             CASES / "stamps_in_bursts.csv",
@@ -105,11 +107,15 @@ def test_the_first_line_of_a_case(file, code, sentence, fdi, tmp_path):
     [
         (
             CASES / "all_saturate_2000dps.csv",
-            "/imu_0 z, /imu_1 z and /imu_2 z measured the end of the range for 1.8 s",
+            "/imu_0 z, /imu_1 z and /imu_2 z reached the end of the range for 1.8 s."
+            " What to do: choose a larger range for /imu_0, /imu_1 and /imu_2",
         ),
         (
             SITL / "calm.tlog",
-            "/imu_1, /imu_2 and /imu_3 repeat one value for long, in 67% of the messages",
+            "/imu_1, /imu_2 and /imu_3 repeat one value for long, in 67% of the messages."
+            " What to do: check the driver of /imu_1, /imu_2 and /imu_3 if the vehicle moved"
+            " meanwhile; coarse values repeat at rest, so judge only the part in flight"
+            " (--start, --end)",
         ),
     ],
 )
@@ -387,6 +393,43 @@ def test_concerns_name_what_is_wrong_and_nothing_else():
         "c repeats the values of a: one sensor, no redundancy",
         "b.x has 5 spikes of one sample",
     ]
+
+
+def test_what_to_do_is_said_once_for_each_kind_of_trouble():
+    some = [
+        ChannelHealth(name="a.x", unit="a", spikes=5),
+        ChannelHealth(name="a.y", unit="a", spikes=7),
+        ChannelHealth(name="b.accel_z", unit="b", saturated_s=2.0, spikes=4),
+    ]
+    assert advice_on(concerns_of(some)) == (
+        "choose a larger range for b; check wiring and power supply of a and b"
+    )
+
+
+@pytest.mark.parametrize("word", [Word.LOOK, Word.CANNOT_TELL])
+def test_a_verdict_that_is_not_clear_says_what_to_do(word, fdi, tmp_path):
+    """A unit with a third of its messages; and a recording of two seconds."""
+    time = np.arange(0, 30 if word is Word.LOOK else 2, 0.02)
+    random = np.random.default_rng(8)
+    turn = 0.4 * np.clip(time - 6, 0, 1)[:, None] * np.sin(np.outer(time, (0.7, 1, 2)))
+    messages = []
+    for k in range(3):
+        rates = turn + random.normal(0, 0.003, turn.shape)
+        for n, (at, rate) in enumerate(
+            zip((time * 1e9).astype(int), rates, strict=True)
+        ):
+            if k != 1 or n < 600 or n % 3 == 0:
+                stamp = START + int(at)
+                messages.append((f"/imu_{k}", stamp, imu(stamp, rate)))
+    messages.sort(key=lambda one: one[1])
+    write_mcap(tmp_path / "bag.mcap", messages)
+    said = fdi("replay", tmp_path / "bag.mcap")
+    first = said.out.splitlines()[0]
+    what = "check connection, driver and bus load of imu_1"
+    if word is Word.CANNOT_TELL:
+        what = "record for longer, with some seconds of rest at the start"
+    assert first.startswith(f"{word.value}: ")
+    assert first.endswith(f" What to do: {what}.")
 
 
 @pytest.mark.skipif(not SITL.is_dir(), reason="../shared/data/sitl is not there")

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from vehicles import vehicle
 
 from fdi_ros.config.config import Config
+from fdi_ros.inspection.findings import Finding, Role, lines_of, verdict_of
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
@@ -303,13 +304,63 @@ def test_settings_that_are_worse_are_not_written(fdi, tmp_path, monkeypatch):
     code, out, _ = fdi(*verb)
     assert code == 4
     assert out.startswith(
-        "NO BETTER THAN BEFORE: in the last 15 s 28 of 54 biases are isolated"
+        "NO BETTER THAN BEFORE: in the last 15 s, 28 of 54 biases are isolated"
     )
     assert "set: nothing" in out
     assert Config.from_file(tmp_path / "made.yaml") == Config.from_file(config)
-    assert (
-        json.loads((tmp_path / "j").read_text())["no_better"]
-        == "28 of 54 biases are isolated instead of 30"
+    figures = json.loads((tmp_path / "j").read_text())
+    assert figures["no_better"] == "28 of 54 biases are isolated instead of 30"
+    # Its turns are too slow for it, so it is no result.
+    nonlinearity = "nonlinearity: not measured; turn faster, both ways about every axis"
+    assert nonlinearity in figures["not_found"]
+    assert not any("not measured" in line for line in figures["found"])
+
+
+@pytest.mark.parametrize("turns", [0.0, 1.0])
+def test_settings_beside_a_unit_that_repeats_one_value_are_not_for_flight(
+    turns, fdi, tmp_path
+):
+    """Of two units, the second one repeats one value from the first seconds on."""
+    time = np.arange(0, 30, 0.01)
+    random = np.random.default_rng(3)
+    turn = 0.5 * np.clip(time - 6, 0, turns)[:, None]
+    turn = turn * np.sin(np.outer(time, (0.7, 1, 2)))
+    rates = [turn + random.normal(0, 0.003, turn.shape) for _ in range(2)]
+    rates[1][time > 3] = rates[1][300]
+    write_mcap(
+        tmp_path / "bag.mcap",
+        imu_messages(
+            START + (time * 1e9).astype(np.int64), np.hstack(rates), TOPICS[:2]
+        ),
+    )
+    made = fdi("setup", tmp_path / "bag.mcap", "--output", tmp_path / "a.yaml")
+    assert made.code == 3
+    first = made.out.splitlines()[0]
+    assert re.match(
+        rf"DO NOT USE: {TOPICS[1]} repeats one value for long, in 90% of the messages, and"
+        r" the other units do not\. What to do: check driver and bus, and record again",
+        first,
+    ), first
+
+
+def test_the_verdict_names_the_unit_for_which_faults_are_not_found():
+    """Without the messages of imu_1 no fault can be isolated."""
+    proof = Finding(
+        Role.WARNING, "proof", "Few.", headline="USABLE FOR LARGE FAULTS ONLY"
+    )
+    slow = Finding(
+        Role.WARNING,
+        "health",
+        "imu_1 delivered 33 % of its messages",
+        headline="USABLE, BUT LOOK",
+        advice="check imu_1",
+    )
+    assert verdict_of([proof, slow]).words == (
+        "USABLE FOR LARGE FAULTS ONLY: Few. Also: imu_1 delivered 33 % of its messages."
+        " What to do: check imu_1"
+    )
+    assert lines_of([proof, slow], Role.WARNING)[1] == (
+        "imu_1 delivered 33 % of its messages. What to do: check imu_1"
     )
 
 
