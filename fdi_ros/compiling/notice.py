@@ -112,16 +112,18 @@ def call_for_each(counter: Callable[[str], None]) -> None:
 
 @contextlib.contextmanager
 def progress_logged(
-    functions: set[str], done: Callable[[], set[str]]
+    functions: set[str], done: Callable[[], set[str]], needs_all: bool = True
 ) -> Iterator[None]:
-    """Log that functions are compiled within the context, and every few seconds how many are done.
+    """Log that functions are compiled within the context, and how many are done, where the number grew.
 
     Parameters
     ----------
     functions
-        Names of the functions to compile.
+        Names of the functions without a result.
     done
         Returns the names of the functions that were compiled so far.
+    needs_all
+        Whether all of them will be compiled. Otherwise neither share nor time left are known.
 
     The time left, reported once a fifth of the functions is done, assumes that the rest takes as
     long for each function.
@@ -132,11 +134,16 @@ def progress_logged(
 
     def report() -> None:
         wait = FIRST_REPORT
+        last = 0
         while not over.wait(wait):
             wait = NOTICE_PERIOD
             left = (functions - done()) & missing()
             count = len(functions) - len(left)
-            if not count:
+            if count == last:
+                continue
+            last = count
+            if not needs_all:
+                LOG.warning("compiling: functions done: %d", count)
                 continue
             share = count / len(functions)
             spent = time.monotonic() - begun
@@ -172,7 +179,9 @@ def announced() -> Iterator[None]:
                 begun = True
                 _watch.counters.append(done.add)
                 stack.callback(_watch.counters.remove, done.add)
-                stack.enter_context(progress_logged(missing(), lambda: done))
+                stack.enter_context(
+                    progress_logged(missing(), lambda: done, needs_all=False)
+                )
 
         stack.enter_context(_watch.calling(hook))
         yield

@@ -11,12 +11,14 @@ import shutil
 import stat
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numba
 import pytest
 
+from fdi_ros.compiling import notice
 from fdi_ros.compiling.cache import Kept as _Kept
 from fdi_ros.compiling.notice import COMPILING, announced, refused
 from fdi_ros.errors import FdiError
@@ -301,7 +303,7 @@ def test_a_planted_lock_is_neither_followed_nor_waited_for(tmp_path):
 # What is seen of compiling -------------------------------------------------------------------------------------------
 
 
-PROGRESS = r"compiling \|[# ]{20}\| \d+ of \d+ functions(, about \d+ s left)?"
+PROGRESS = r"compiling: functions done: \d+"
 
 
 def new_function():
@@ -320,6 +322,28 @@ def test_compiling_is_announced_before_or_refused(said):
         two(1)
     assert two(1) == 2
     assert said.messages == [COMPILING]
+
+
+def test_progress_of_compiling_is_logged_only_where_it_grew(said, monkeypatch):
+    asked = threading.Event()
+    counts = iter([0, 1, 1, 1, 2, 2, 2])
+
+    def done():
+        count = next(counts, None)
+        if count is None:
+            asked.set()
+        return set("abcd"[: 2 if count is None else count])
+
+    monkeypatch.setattr(notice, "FIRST_REPORT", 0.0)
+    monkeypatch.setattr(notice, "NOTICE_PERIOD", 0.0)
+    monkeypatch.setattr(notice, "missing", lambda: set("abcd"))
+    with notice.progress_logged(set("abcd"), done, needs_all=False):
+        asked.wait()
+    assert said.messages == [
+        COMPILING,
+        "compiling: functions done: 1",
+        "compiling: functions done: 2",
+    ]
 
 
 def test_a_verb_says_it_before_its_result(tmp_path, root, flight):
