@@ -250,7 +250,7 @@ class Evidence:
             faulty = track.axes(ChannelState.FAULTY)
             axes = faulty | accused if k == odd else faulty
             if not self._is_odd(k, units):
-                axes = axes - track.outdated
+                axes = axes - (track.outdated - self._axes_off_again(k, units, now))
             blamed = any(track.sizes[axis] >= self._min_size for axis in axes)
             if k in out or blamed:
                 self._note_wrong(track, partners[k])
@@ -458,6 +458,22 @@ class Evidence:
             if not self._tracks[k].doubts <= refuted | self._tracks[unit].doubts:
                 return False
         return True
+
+    def _axes_off_again(self, unit: int, units: Sequence[int], now: int) -> set[int]:
+        """Return the axes on which an IMU is far off while two others agree on this axis.
+
+        One of these two may be bad on another axis: then no two IMUs agree on all axes.
+        """
+        others = [k for k in units if k != unit]
+        if len(others) != 2 or unit not in units:
+            return set()
+        between = self._pairs[others[0], others[1]].mean
+        doubted = {axis for k in others for axis in self._tracks[k].axes(*DOUBTS)}
+        return {
+            axis
+            for axis in self._clear_axes(unit, units, now) - doubted
+            if between[axis] < self._min_size
+        }
 
     def _odd_one(self, units: Sequence[int], now: int) -> tuple[int, set[int], int]:
         """Return an IMU that is bad although the monitor does not name it.

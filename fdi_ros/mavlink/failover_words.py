@@ -130,7 +130,7 @@ def announce(
         k: imu_condition(k, notes, memories, view, now, settings)
         for k in range(len(notes))
     }
-    found[VEHICLE] = vehicle_condition(notes, memories, view, now)
+    found[VEHICLE] = vehicle_condition(notes, memories, view, now, settings)
     announced = dict(state.announced)
     words = []
     for key, condition in found.items():
@@ -148,6 +148,12 @@ def announce(
     return WordsState(notes, announced, view.boots, now), words
 
 
+def is_odd_known(view: View, settings: PolicySettings) -> bool:
+    """Return whether an IMU that differs is the odd one: others agree, and the monitor finds one OK."""
+    two_agree = not all(is_apart(imu, settings) for imu in view.imus)
+    return two_agree and any(imu.ok for imu in view.imus)
+
+
 def imu_condition(
     k: int,
     notes: Sequence[Note],
@@ -162,9 +168,6 @@ def imu_condition(
     is_out = memory.ours and memory.seen is False
     stays = is_out and not view.armed
     asked_back = memory.ours and not memory.held and memory.tries > QUICK_TRIES
-    # Where no two agree, or the monitor finds none OK, nobody is the odd one.
-    two_agree = not all(is_apart(each, settings) for each in view.imus)
-    is_odd_known = two_agree and any(each.ok for each in view.imus)
     is_long_apart = has_stood(notes[k].apart_since, UNNAMED, now)
     is_near = imu.size < settings.min_size
     checks = (
@@ -181,7 +184,7 @@ def imu_condition(
         (is_out, Condition.OUT),
         (memory.left_alone, Condition.LEFT_ALONE),
         (memory.seen is False, Condition.UNUSED),
-        (is_long_apart and is_odd_known, Condition.APART),
+        (is_long_apart and is_odd_known(view, settings), Condition.APART),
         (memory.seen and is_near, Condition.FINE),
     )
     return next((condition for holds, condition in checks if holds), None)
@@ -192,6 +195,7 @@ def vehicle_condition(
     memories: Sequence[Memory],
     view: View,
     now: int,
+    settings: PolicySettings,
 ) -> Condition | None:
     """Return the condition of the vehicle. None: nothing is to be announced."""
     is_heard = any(imu.delivers for imu in view.imus)
@@ -203,7 +207,6 @@ def vehicle_condition(
     ]
     lanes = sum(angle < LOST_LANE for angle in angles)
     differs = any(has_stood(note.apart_since, UNNAMED, now) for note in notes)
-    is_any_ok = any(imu.ok for imu in view.imus)
     agreeing = [
         imu.agreed is not None and memory.seen
         for memory, imu in zip(memories, view.imus, strict=True)
@@ -212,7 +215,10 @@ def vehicle_condition(
         (view.armed and is_heard and alive <= 1, Condition.ALONE),
         (view.armed and by_us and left <= 1, Condition.LAST_IMU),
         (view.armed and lanes <= 1 and lanes < len(angles), Condition.LAST_LANE),
-        (view.armed and differs and not is_any_ok, Condition.DISAGREE),
+        (
+            view.armed and differs and not is_odd_known(view, settings),
+            Condition.DISAGREE,
+        ),
         (sum(map(bool, agreeing)) > 1, Condition.REDUNDANT),
     )
     return next((condition for holds, condition in checks if holds), None)

@@ -571,6 +571,25 @@ def test_of_three_imus_an_old_name_counts_for_the_odd_one() -> None:
     assert not watched.run(1.0).blamed(1.0)
 
 
+@pytest.mark.parametrize(
+    ("size", "third", "blamed"),
+    [(0.5, OK, {0, 1}), (0.1, OK, {1}), (0.5, AMBIGUOUS, {1})],
+)
+def test_an_old_name_counts_on_an_axis_on_which_the_others_agree(
+    size: float, third: int, blamed: set[int]
+) -> None:
+    """A harmless error stays declared; another IMU fails on y; then the first error grows."""
+    watched = Watched()
+    watched.states[0] = FAULTY
+    watched.run(4.0)
+    watched.gyros[1] = biased(1.0, axis=1)
+    watched.states[4] = FAULTY
+    assert watched.blamed(1.0) == {1}
+    watched.states[6] = third
+    watched.gyros[0] = biased(size, axis=0)
+    assert watched.blamed(2.0) == blamed
+
+
 def test_a_monitor_that_died_names_nobody() -> None:
     watched = Watched()
     watched.states[0] = FAULTY

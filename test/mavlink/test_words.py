@@ -101,6 +101,7 @@ DEAD = Memory(seen=True, dead_since=0)
         (Condition.LAST_IMU, (OUT, OUT), (BAD, BAD), (ASTRAY, ASTRAY)),
         (Condition.LAST_LANE, (), (DOUBTED,) * 3, (ASTRAY, ASTRAY, LONG_APART)),
         (Condition.DISAGREE, (), (DOUBTED,) * 3, (LONG_APART,)),
+        (Condition.DISAGREE, (), (APART,) * 3, (LONG_APART,)),
         (Condition.REDUNDANT, (), (APART,), (LONG_APART,)),
         (None, (), (APART, APART), (LONG_APART,)),
     ],
@@ -116,7 +117,7 @@ def test_the_vehicle_has_the_first_condition_that_holds(
     """Nothing is announced of a disarmed vehicle but good news."""
     notes = (*notes, *(Note(),) * (3 - len(notes)))
     memories = (*memories, *(USED,) * (3 - len(memories)))
-    found = vehicle_condition(notes, memories, view(*imus, armed=armed), NOW)
+    found = vehicle_condition(notes, memories, view(*imus, armed=armed), NOW, SETTINGS)
     ending = (None, Condition.REDUNDANT) if not armed else (condition,)
     assert found in ending
 
