@@ -262,15 +262,16 @@ def _note(
 class Readiness(NamedTuple):
     """Memory of the texts on failover itself.
 
-    1. ``no failover: REASON`` while armed and heard, once the reason has stood for `ANNOUNCED_AFTER`,
-       a late monitor at once.
+    1. ``no failover: REASON`` once the reason has stood for `ANNOUNCED_AFTER` while armed and heard,
+       a late monitor at once. An order may end a reason right after arming.
     2. ``failover is ready`` once no reason has stood for that time: the first time, and
        after such a text. While an IMU is out of use: ``failover acts again``, only after
        such a text.
     """
 
     why: str | None = None  #: Present reason. Empty: none. None: not known yet.
-    since: int = LONG_AGO  #: When it began, ns.
+    since: int = LONG_AGO  #: When it began, or could be announced since, ns.
+    may_warn: bool = False  #: A reason could be announced.
     announced: str | None = None  #: Reason announced last.
 
     def hear(
@@ -290,7 +291,9 @@ class Readiness(NamedTuple):
         now
             Time, ns.
         """
-        state = self if why == self.why else self._replace(why=why, since=now)
+        begins = why != self.why or (why and may_warn and not self.may_warn)
+        since = now if begins else self.since
+        state = self._replace(why=why, since=since, may_warn=may_warn)
         stands = why == MONITOR_LATE or now - state.since >= ANNOUNCED_AFTER
         is_news = may_warn if why else not (is_out and not self.announced)
         if why == self.announced or not stands or not is_news:

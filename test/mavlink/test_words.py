@@ -228,6 +228,12 @@ SLOW = "link is slow"
             [(9.0, "", False, True), (9.0, SLOW, False, True), (9.0, "", True, True)],
             ["failover is ready", f"no failover: {SLOW}", "failover acts again"],
         ),
+        # Right after arming an order may end the reason.
+        ([(9.0, SLOW, False, False), (2.9, SLOW, False, True)], []),
+        (
+            [(9.0, SLOW, False, False), (3.1, SLOW, False, True)],
+            [f"no failover: {SLOW}"],
+        ),
         # An IMU that was out of use and is back is no news of failover.
         (
             [(9.0, "", False, True), (9.0, "", True, True), (9.0, "", False, True)],
