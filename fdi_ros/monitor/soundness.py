@@ -10,7 +10,7 @@ a whole flight, the live monitor its last seconds, by the same records.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
@@ -138,9 +138,7 @@ class Trouble(Enum):
         "judge only the part in flight (--start, --end), or record again, with rest at the start and"
         " less vibration"
     )
-    LEFT_OUT = (
-        "to judge {who}, name the topic in a config (--config), or mend its messages"
-    )
+    LEFT_OUT = "to judge {who}, complete its data, or name it in a config (--config)"
     DELIVERY = "check connection, driver and bus load of {who}"
     COPY = "give {who} a sensor of its own: check wiring and driver"
     DOUBT = "make a longer recording: the suspicion of {who} is still open"
@@ -264,67 +262,21 @@ def concerns_of(
     rate
         How the fused rate was published. None: not measured.
     """
-    slow = [unit for unit in units if _is_slow(unit)]
-    by_unit = {unit.name for unit in slow}
+    by_unit = {unit.name for unit in units if _is_slow(unit)}
     alone = [one for one in channels if one.unit not in by_unit]
+    left_out = [
+        Concern(Word.LOOK, Trouble.LEFT_OUT, (topic,), f"is left out: {why}")
+        for topic, why in unused
+    ]
     return [
-        *_alike(
-            [one for one in channels if one.checked < LEAST_CHECKED],
-            Word.CANNOT_TELL,
-            Trouble.UNCHECKED,
-            lambda some: (
-                "could be checked in only"
-                f" {100 * min(one.checked for one in some):.0f} % of the samples"
-            ),
-        ),
-        *(
-            Concern(Word.LOOK, Trouble.LEFT_OUT, (topic,), f"is left out: {why}")
-            for topic, why in unused
-        ),
-        *(
-            Concern(Word.LOOK, Trouble.DELIVERY, (unit.name,), _slow_words(unit))
-            for unit in slow
-        ),
-        *(
-            Concern(
-                Word.LOOK,
-                Trouble.COPY,
-                (unit.name,),
-                f"repeats the values of {unit.copy_of}: one sensor, no redundancy",
-            )
-            for unit in units
-            if unit.copy_of
-        ),
-        *_alike(
-            [one for one in alone if one.delivered < LEAST_DELIVERED],
-            Word.LOOK,
-            Trouble.DELIVERY,
-            lambda some: (
-                "gave a value in only"
-                f" {100 * min(one.delivered for one in some):.0f} % of the samples"
-            ),
-        ),
+        *_unchecked([one for one in channels if one.checked < LEAST_CHECKED]),
+        *left_out,
+        *_unit_concerns(units),
+        *_incomplete([one for one in alone if one.delivered < LEAST_DELIVERED]),
         *_doubts([one for one in alone if one.doubt]),
-        *_alike(
-            [one for one in channels if one.saturated_s > 0.0],
-            Word.LOOK,
-            Trouble.END_OF_RANGE,
-            lambda some: (
-                "reached the end of the range for"
-                f" {figures(max(one.saturated_s for one in some), 2)} s"
-            ),
-        ),
+        *_at_end_of_range([one for one in channels if one.saturated_s > 0.0]),
         *_rate_concerns(rate),
-        *(
-            Concern(
-                Word.LOOK,
-                Trouble.SPIKES,
-                (one.name,),
-                f"has {one.spikes} spikes of one sample",
-            )
-            for one in channels
-            if one.spikes >= LEAST_SPIKES
-        ),
+        *_spiky([one for one in channels if one.spikes >= LEAST_SPIKES]),
         *_noise_concerns(channels),
     ]
 
@@ -386,16 +338,67 @@ def _slow_words(unit: UnitHealth) -> str:
     return f"{words} ({rates} from {unit.slow_from_s:.0f} s {until})"
 
 
+def _unit_concerns(units: Sequence[UnitHealth]) -> list[Concern]:
+    """Return concerns about what units deliver."""
+    slow = [
+        Concern(Word.LOOK, Trouble.DELIVERY, (unit.name,), _slow_words(unit))
+        for unit in units
+        if _is_slow(unit)
+    ]
+    copies = [
+        Concern(
+            Word.LOOK,
+            Trouble.COPY,
+            (unit.name,),
+            f"repeats the values of {unit.copy_of}: one sensor, no redundancy",
+        )
+        for unit in units
+        if unit.copy_of
+    ]
+    return slow + copies
+
+
 def _alike(
-    some: Sequence[ChannelHealth],
-    word: Word,
-    trouble: Trouble,
-    words: Callable[[Sequence[ChannelHealth]], str],
+    some: Sequence[ChannelHealth], word: Word, trouble: Trouble, words: str
 ) -> list[Concern]:
-    """Return one concern about all of some channels, or none."""
+    """Return one concern about all of some channels."""
+    return [Concern(word, trouble, tuple(one.name for one in some), words)]
+
+
+def _unchecked(some: Sequence[ChannelHealth]) -> list[Concern]:
     if not some:
         return []
-    return [Concern(word, trouble, tuple(one.name for one in some), words(some))]
+    least = min(one.checked for one in some)
+    words = f"could be checked in only {100 * least:.0f} % of the samples"
+    return _alike(some, Word.CANNOT_TELL, Trouble.UNCHECKED, words)
+
+
+def _incomplete(some: Sequence[ChannelHealth]) -> list[Concern]:
+    if not some:
+        return []
+    least = min(one.delivered for one in some)
+    words = f"gave a value in only {100 * least:.0f} % of the samples"
+    return _alike(some, Word.LOOK, Trouble.DELIVERY, words)
+
+
+def _at_end_of_range(some: Sequence[ChannelHealth]) -> list[Concern]:
+    if not some:
+        return []
+    longest = max(one.saturated_s for one in some)
+    words = f"reached the end of the range for {figures(longest, 2)} s"
+    return _alike(some, Word.LOOK, Trouble.END_OF_RANGE, words)
+
+
+def _spiky(some: Sequence[ChannelHealth]) -> list[Concern]:
+    return [
+        Concern(
+            Word.LOOK,
+            Trouble.SPIKES,
+            (one.name,),
+            f"has {one.spikes} spikes of one sample",
+        )
+        for one in some
+    ]
 
 
 def _doubts(some: Sequence[ChannelHealth]) -> list[Concern]:

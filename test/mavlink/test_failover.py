@@ -1151,7 +1151,7 @@ def test_of_the_lanes_that_exist_the_last_one_is_announced(
     autopilot.reboot(0)
     talk = Monitored(tmp_path, autopilot).run(12.0)
     autopilot.armed = True
-    talk.run(3.0)
+    talk.run(5.0)
     words = f"no failover: EK3_IMU_MASK is without IMU {mask.bit_length() + 1}"
     assert (words in talk.texts) is (mask < 7)
     autopilot.read_only.update(PARAMETERS)
