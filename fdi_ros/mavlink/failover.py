@@ -10,7 +10,7 @@ the orders and announces the conditions. All decisions are the policy's.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from fdi_ros.mavlink.failover_evidence import SILENCE, Evidence
@@ -33,9 +33,11 @@ from fdi_ros.mavlink.failover_ready import (
 )
 from fdi_ros.mavlink.failover_words import (
     SIZING,
+    Announced,
     Condition,
     Note,
     Readiness,
+    Words,
     WordsState,
     announce,
     imu_name,
@@ -58,6 +60,9 @@ USE_KNOWN_FOR = 10 * NS  #: An older report of a parameter is not known any more
 #: A monitor without diagnostics for this time is in doubt, ns.
 REPORTED_WITHIN = 5 * NS
 COUNTED = 5 * NS  #: Losses are counted over this time, ns.
+#: After this silence what was sent since the last message counts as lost, ns. Heartbeats
+#: alone come once a second.
+TEXT_LOST = 1200 * MS
 BOOT_STEP = 3 * NS  #: A boot time that grows by more is another boot, ns,
 #: if the autopilot's time has gone back, or after this time over a link that is quick, ns.
 BACKLOG = 10 * NS
@@ -126,6 +131,19 @@ class Failover:
         self._counted = (0, 0, 0)  # time, ns, and messages lost and received until then
         self._lost = math.nan  # share of messages lost of late
         self._readiness = Readiness()
+        self._said_at = 0  # time of the last text, ns
+        #: What was announced before a message of the autopilot: conditions and reason.
+        self._received = self._announced
+
+    @property
+    def _announced(self) -> tuple[Mapping[int, Announced], str | None]:
+        return self._words.announced, self._readiness.announced
+
+    @_announced.setter
+    def _announced(self, known: tuple[Mapping[int, Announced], str | None]) -> None:
+        conditions, reason = known
+        self._words = self._words._replace(announced=conditions)
+        self._readiness = self._readiness._replace(announced=reason)
 
     @property
     def out(self) -> tuple[int, ...]:
@@ -174,9 +192,8 @@ class Failover:
         self._try_orders(view, now)
         for imu, use in decision.orders:
             self._vehicle.set_parameter(INS_USE[imu], float(use))
-        self._announce_conditions(view, now)
         self._count_losses(now)
-        self._announce_readiness(view, now)
+        self._announce(view, now)
         if error := self._file.keep(self._saved(now), now):
             self._vehicle.events.append(error)
 
@@ -229,7 +246,7 @@ class Failover:
             why = self._not_ready(view, facts, now)
             return (Level.WARN, f"no failover: {why}") if why else (Level.OK, "ready")
         why = doubt(view, facts)
-        asked = [k for k in self.out if self._is_asked(k)]
+        asked = [k for k in self.out if self._state.memories[k].seen is True]
         out = [k for k in self.out if k not in asked]
         parts = (
             (out, f"out of use: {self._names(out)} of system {self._system}"),
@@ -239,11 +256,6 @@ class Failover:
             (why, f"no failover: {why}"),
         )
         return Level.WARN, "; ".join(words for holds, words in parts if holds)
-
-    def _is_asked(self, imu: int) -> bool:
-        """Return whether an IMU was ordered out of use, but is reported in use."""
-        memory = self._state.memories[imu]
-        return memory.held and memory.seen is True
 
     def _names(self, imus: Sequence[int]) -> str:
         return ", ".join(imu_name(imu, self._channels) for imu in imus)
@@ -353,23 +365,52 @@ class Failover:
             restore=restore,
         )
 
-    def _announce_conditions(self, view: View, now: int) -> None:
-        """Announce conditions, that of `OUT` once the error is known or `SIZING` is over."""
+    def _announce(self, view: View, now: int) -> None:
+        """Announce conditions and readiness while the autopilot is heard.
+
+        What was sent into a gap of the link is announced anew after the gap.
+        """
+        silence = now - self._vehicle.heard
+        if self._vehicle.heard > self._said_at and not self._unsized:
+            self._received = self._announced
+        if silence >= TEXT_LOST:
+            self._announced = self._received
+            self._unsized.clear()
+        before = self._announced
         memories = self._state.memories
-        self._words, words = announce(self._words, memories, view, now, self._settings)
-        for key, condition in words:
+        self._words, conditions = announce(
+            self._words, memories, view, now, self._settings
+        )
+        readiness = self._judge_readiness(view, now)
+        if silence >= SILENCE:
+            self._announced = before
+            return
+        texts = self._condition_texts(conditions, now)
+        if readiness is not None:
+            texts.append((readiness.severity, f"FDI: {readiness.text}"))
+        for severity, text in texts:
+            self._said_at = now
+            self._say(severity, text)
+
+    def _condition_texts(
+        self, conditions: Sequence[tuple[int, Condition]], now: int
+    ) -> list[tuple[int, str]]:
+        """Return severities and texts, that of `OUT` once the error is known or `SIZING` is over."""
+        texts = []
+        for key, condition in conditions:
             self._unsized.pop(key, None)
             if condition is Condition.OUT:
                 self._unsized[key] = now
             else:
-                severity = condition.value.severity
-                self._say(severity, text_of(key, condition, self._channels))
+                text = text_of(key, condition, self._channels)
+                texts.append((condition.value.severity, text))
         for imu, since in list(self._unsized.items()):
             error = self.evidence.error(imu, now)
             if error is not None or now - since >= SIZING:
                 del self._unsized[imu]
                 text = text_of(imu, Condition.OUT, self._channels, error)
-                self._say(Condition.OUT.value.severity, text)
+                texts.append((Condition.OUT.value.severity, text))
+        return texts
 
     def _say(self, severity: int, text: str) -> None:
         text = text[:TEXT_LENGTH]
@@ -384,15 +425,14 @@ class Failover:
             more = counts["lost"] - lost
             self._lost = more / max(1, more + counts["in use"] - received)
 
-    def _announce_readiness(self, view: View, now: int) -> None:
-        """Announce that failover is ready, or not any more and why, once that lasts."""
+    def _judge_readiness(self, view: View, now: int) -> Words | None:
+        """Return that failover is ready, or not any more and why, once that lasts."""
         facts = self._facts(view, now)
         is_out = bool(self.out)
         why = doubt(view, facts) if is_out else self._not_ready(view, facts, now)
         may_warn = view.armed and self._vehicle.in_reach
         self._readiness, words = self._readiness.hear(why, is_out, may_warn, now)
-        if words is not None:
-            self._say(words.severity, f"FDI: {words.text}")
+        return words
 
     def _facts(self, view: View, now: int) -> Facts:
         """Return what readiness depends on beside the view."""

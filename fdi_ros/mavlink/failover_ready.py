@@ -101,7 +101,7 @@ def _reasons(
             (memory.without_notch, "reboot before flight"),
             (imu.use is None, f"use of {name} is not reported"),
             (imu.use is False, f"{name} not in use"),
-            (memory.left_alone, f"{name} left alone until disarmed"),
+            (memory.left_alone, f"{name} left alone in this flight"),
             (imu.blamed, f"{name} faulty and in use"),
             (is_apart(imu, settings), f"{name} differs and is in use"),
             (not imu.delivers, f"{name} sends nothing"),

@@ -12,7 +12,8 @@ that holds. `announce` compares it with the last one announced:
 3. While no condition holds, nothing is announced, and the last condition counts on.
 4. At the start the last ones are `FINE` and `REDUNDANT`, so these two are announced only
    after another.
-5. Without a link nothing is announced.
+5. Without a link nothing is announced, and what was announced into a gap of the link counts
+   as not announced (`failover.Failover`).
 
 The text of `OUT` waits `SIZING` at most for the size of the error. `Readiness` announces
 whether failover itself works.
@@ -76,7 +77,7 @@ class Condition(Enum):
     NOT_OK = Words(WARNING, "stays out, monitor finds it not OK")
     UNTURNED = Words(WARNING, "stays out until turned by hand")
     OUT = Words(CRITICAL, "out of use", urgent=True)
-    LEFT_ALONE = Words(WARNING, "left alone until disarmed")
+    LEFT_ALONE = Words(WARNING, "left alone in this flight")
     UNUSED = Words(WARNING, "not in use, not by failover")
     APART = Words(WARNING, "differs from the others")
     FINE = Words(INFO, "in use, differs no more")
@@ -182,7 +183,7 @@ def imu_condition(
         # It agrees, and goes back after its pause.
         (stays, None),
         (is_out, Condition.OUT),
-        (memory.left_alone, Condition.LEFT_ALONE),
+        (view.armed and memory.left_alone, Condition.LEFT_ALONE),
         (memory.seen is False, Condition.UNUSED),
         (is_long_apart and is_odd_known(view, settings), Condition.APART),
         (memory.seen and is_near, Condition.FINE),

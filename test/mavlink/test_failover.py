@@ -690,7 +690,11 @@ def test_an_imu_that_somebody_else_has_set_is_left_alone(
     assert autopilot.sets[count:] == []
     assert flying.in_use[0]
     assert flying.texts[-1] == "IMU 1 faulty AND IN USE: land"
-    assert "IMU 1 left alone until disarmed" in flying.heal(1, 2.0).texts
+    assert "IMU 1 left alone in this flight" in flying.heal(1, 2.0).texts
+    # After landing it is no news.
+    said = len(flying.fault(1, 0.3, seconds=3.0).texts)
+    autopilot.armed = False
+    assert flying.run(4.0).texts[said:] == []
 
 
 def test_one_lane_left_is_announced_and_a_short_hit_is_none(flying: Monitored) -> None:
@@ -906,6 +910,48 @@ def test_an_order_without_effect_is_not_shown_as_out_of_use(flying: Monitored) -
     assert reason(flying) == "ordered out, reported in use: IMU 2"
     flying.autopilots[0].read_only.clear()
     assert reason(flying.run(4.0)).startswith("out of use: IMU 2 of system 1")
+
+
+def test_an_imu_in_use_is_not_shown_as_out_of_use_as_it_goes_back(
+    flying: Monitored,
+) -> None:
+    flying.autopilots[0].read_only.update(PARAMETERS)
+    flying.fault(2, 0.3, seconds=4.0)
+    flying.failover.restore(flying.now)
+    assert reason(flying) == "ordered out, reported in use: IMU 2"
+    assert reason(flying.heal(2, 4.0)).startswith("no failover")
+
+
+def test_a_gap_of_the_link_hides_no_end_and_no_begin_of_a_doubt(
+    flying: Monitored,
+) -> None:
+    """What is sent into a gap reaches nobody, and its end is no news then."""
+    said = len(flying.texts)
+    for lasts in (False, True):
+        flying.cut = True
+        flying.failover.age = 1.5
+        flying.run(2.0)
+        flying.failover.age = 1.5 if lasts else 0.02
+        flying.cut = False
+        flying.run(1.0)
+        flying.failover.age = 0.02
+        flying.run(5.0)
+        late = ["no failover: the monitor is late", "failover is ready"]
+        assert flying.texts[said:] == late * lasts
+
+
+def test_a_condition_that_begins_in_a_gap_of_the_link_is_announced_after_it(
+    flying: Monitored,
+) -> None:
+    flying.fault(2, 0.3, seconds=1.0)
+    flying.autopilots[0].armed = False
+    flying.fault(2, 0.05, (OK, SUSPECT, OK), seconds=4.0)
+    assert flying.texts[-1] == "IMU 2 stays out, monitor finds it not OK"
+    flying.cut = True
+    flying.fault(2, 0.05, seconds=1.5)
+    flying.cut = False
+    flying.run(1.0)
+    assert flying.texts[-1] == "IMU 2 still faulty, stays out of use"
 
 
 @pytest.mark.parametrize("by_station", [False, True])

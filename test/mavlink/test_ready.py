@@ -64,7 +64,7 @@ def test_all_good_is_ready_and_two_imus_are_not() -> None:
         ({"second": {"size": 0.05}}, "IMU 2 differs and is in use"),
         ({"second": {"lane": False}}, "EK3_IMU_MASK is without IMU 2"),
         ({"memory": {"acquainted": False}}, "IMU 2 not seen to agree yet"),
-        ({"memory": {"left_alone": True}}, "IMU 2 left alone until disarmed"),
+        ({"memory": {"left_alone": True}}, "IMU 2 left alone in this flight"),
     ],
 )
 def test_each_doubt_has_its_sentence(given: dict[str, Any], words: str) -> None:
