@@ -302,7 +302,8 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
 def _pieces_of_one(folder: Path) -> list[Path]:
     """Return the files of a bag that was cut off, in the order of the numbers in their names.
 
-    `BagError` if the names, without these numbers, are those of several recordings.
+    `BagError` if the names, without these numbers, are those of several recordings, or if
+    there are logs or tables beside them.
     """
     paths = [
         child
@@ -311,8 +312,15 @@ def _pieces_of_one(folder: Path) -> list[Path]:
     ]
     paths.sort(key=lambda child: natural_order(child.name))
     stems = {re.sub(r"[_-]?[0-9]*$", "", path.name.partition(".")[0]) for path in paths}
-    if len(stems) > 1 and not (folder / "metadata.yaml").exists():
-        names = first_of([shown(path.name) for path in paths], MOST_NAMED)
+    others = [
+        child
+        for child in folder.iterdir()
+        if paths and child.is_file() and child.name.lower().endswith(LOG_SUFFIXES)
+    ]
+    several = len(stems) > 1 or others
+    if several and not (folder / "metadata.yaml").exists():
+        found = [shown(path.name) for path in (*paths, *sorted(others))]
+        names = first_of(found, MOST_NAMED)
         raise BagError(
             f"{folder} holds several recordings ({names}): name one of them, or run fdi fleet"
             " on the folder"

@@ -137,6 +137,13 @@ def test_a_folder_of_recordings_is_not_read_as_one(tmp_path, fdi, refused):
     said = refused("replay", tmp_path)
     assert "holds several recordings (monday.mcap, tuesday.mcap): name one" in said
     assert "fdi fleet" in said
+    table = tmp_path / "wednesday.csv"
+    table.write_text("time\n")
+    (tmp_path / "tuesday.mcap").rename(tmp_path / "monday_1.mcap")
+    said = refused("replay", tmp_path)
+    assert "(monday.mcap, monday_1.mcap, wednesday.csv): name one" in said
+    table.unlink()
+    (tmp_path / "monday_1.mcap").rename(tmp_path / "tuesday.mcap")
     # The pieces of one bag differ in their numbers.
     for k, name in enumerate(("monday.mcap", "tuesday.mcap")):
         (tmp_path / name).rename(tmp_path / f"flight_{k}.mcap")
@@ -375,7 +382,7 @@ def test_of_a_default_log_of_px4_of_any_length_the_means_are_said(
     assert f"imu_1 less imu_0, median of {seconds} means: " in out
     z = float(out.partition("means: ")[2].split()[2])
     assert z == pytest.approx(-0.25, abs=0.01)
-    assert "imu_1 41.0 to 41.0 degC, 3 errors" in out
+    assert "imu_1 up to 41 degC, 3 errors" in out
 
 
 def test_a_telemetry_log_without_heartbeat_is_read(tmp_path):
