@@ -590,7 +590,9 @@ def _refuse(parser: argparse.ArgumentParser, verb: str, words: Sequence[str]) ->
         ]
         hint = did_you_mean(unknown.partition("=")[0], [*options, "--help"])
         parser.error(f"fdi {verb} has no option {unknown!r}, {hint}")
-    parser.error(f"unrecognized arguments: {' '.join(words)}")
+    is_cut = any("=" in word for word in words)
+    hint = ". Write a value with blanks in quotes" if is_cut else ""
+    parser.error(f"unrecognized arguments: {' '.join(words)}{hint}")
 
 
 class _PrintCompletion(argparse.Action):

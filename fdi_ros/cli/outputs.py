@@ -84,6 +84,7 @@ def progress(
 
     def tick() -> None:
         """Refresh the bar or print a line, even while the work itself reports nothing."""
+        said = 0.0
         while not ended.wait(SAID_EVERY if bar.disable else _BAR_PERIOD):
             if is_compiling():
                 continue  # The compiler has progress lines of its own.
@@ -94,8 +95,11 @@ def progress(
             share = done
             words = f"{spent:.0f} s so far"
             if share > 0:
-                left = spent * (1 / share - 1)
-                words = f"{share:.0%} done after {spent:.0f} s, about {left:.0f} s left"
+                words = f"{share:.0%} done after {spent:.0f} s"
+            if said < share < 1.0:
+                # While one part takes long, nothing shows how long.
+                words += f", about {spent * (1 / share - 1):.0f} s left"
+            said = share
             with suppress(OSError, ValueError):
                 stream.write(f"fdi: {what}{', ' if what else ''}{words}\n")
                 stream.flush()

@@ -648,7 +648,9 @@ def look(folder, code, said, errors):
     """What is wrong with what a case said and left; empty if nothing."""
     made = sorted(os.listdir(folder / "out"))
     # A loaded machine makes a verb report how far it is.
-    errors = re.sub(r"^fdi: .*(so far|s left)\n", "", errors, flags=re.MULTILINE)
+    errors = re.sub(
+        r"^fdi: .*(so far|s left|after [0-9]+ s)\n", "", errors, flags=re.MULTILINE
+    )
     one_line = errors.startswith("fdi: ") and errors.count("\n") == 1
     for text, well in (
         (f"exit code {code}: {errors}", code in (0, 2, 3, 4)),

@@ -453,6 +453,7 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
         ),
         ("replay FLIGHT --config FLAT", "do not span three dimensions"),
         ("replay FLIGHT --config LONG", "norm"),
+        (f"{REPLAY} --fault channel=g1 kind=bias size=1", "blanks in quotes"),
         (f"{REPLAY} --detector sequental", "did you mean 'sequential'?"),
         (f"{REPLAY} --fault 'channel=g1 kind=bais size=1'", "did you mean 'bias'?"),
         (f"{REPLAY} --fault 'channel=g_1 kind=bias size=1'", "did you mean 'g1'?"),
@@ -814,4 +815,7 @@ def test_how_much_is_done_is_a_bar_on_a_terminal_and_elsewhere_a_line_now_and_th
                 show(0.5)
                 time.sleep(0.11)
             assert bool(re.search(said, stream.getvalue())) != quiet
+            # While nothing more is done, how long it takes is not known.
+            lines = re.findall("50% done.*s left", stream.getvalue())
+            assert len(lines) <= 1
             assert not quiet or stream.getvalue() == ""
