@@ -232,8 +232,8 @@ class DataflashLog(FlightLog):
     refusal = "is no log of ArduPilot"
     kinds = tuple(_VALUES)
     settings = (
-        "ArduPilot: LOG_BITMASK bit 18, Fast IMU (ArduCopter), or bit 19, Raw IMU, "
-        "or INS_RAW_LOG_OPT bit 1, all gyros"
+        "on ArduPilot, set LOG_BITMASK bit 18 (Fast IMU, ArduCopter) or 19 (Raw IMU),"
+        " or INS_RAW_LOG_OPT bit 1 (all gyros)"
     )
     one_imu = (
         "one IMU cannot be checked: this autopilot logged no other ({})."

@@ -572,12 +572,12 @@ class FlightLog(BagFile):
                 f"{count} {shown(name, 32)}"
                 for name, count in self.counts.most_common(_MOST_NAMES)
             )
-            return f" has no {' or '.join(self.kinds)}, it has {most or 'no records'}: {setting}"
+            return f" has no {' or '.join(self.kinds)}, it has {most or 'no records'}. What to do: {setting}"
         has = ", ".join((*there, *unread))
         if not unread and max(map(len, kinds.values())) < self.fewest_imus:
             return f": {self.one_imu.format(has)}"
-        needed = f"two IMUs or more, each by itself, at {self.slowest:g} Hz or more, {_FEWEST} samples or more"
-        return f" has {has}; needed: {needed}: {setting}"
+        needed = f"two IMUs or more, each with {_FEWEST} samples or more at {self.slowest:g} Hz or more"
+        return f" has {has}; needed: {needed}. What to do: {setting}"
 
 
 def _logged(kind: str, tracks: Sequence[Track]) -> str:

@@ -86,7 +86,7 @@ class Tlog(LibraryLog):
     magic = b"\0"
     refusal = "is no log of a ground station (.tlog)"
     kinds = tuple(dict.fromkeys(message.kind for message in IMU_MESSAGES.values()))
-    settings = "ArduPilot: SRn_RAW_SENS, from 4.7 on MAVn_RAW_SENS"
+    settings = "on ArduPilot, raise SRn_RAW_SENS (from 4.7 on MAVn_RAW_SENS)"
     one_imu = (
         "one IMU cannot be checked: this autopilot sent no other ({}). If the board has more, it should send"
         " SCALED_IMU2 and SCALED_IMU3; for ArduPilot, check INS_ENABLE_MASK"

@@ -82,7 +82,7 @@ _TEMPERATURES = (("gyro_device_id", "temperature_gyro"), ("device_id", "temperat
 """Fields with the device of a gyro and its temperature."""
 _COUNTED_FIELDS = ("gyro_error_count", "gyro_clipping")
 _HELD = {
-    "temperature_gyro": "{low:.1f} to {high:.1f} degC",
+    "temperature_gyro": "up to {high:.0f} degC",
     "gyro_vibration_metric": "vibration up to {high:.2g} rad/s",
     "gyro_error_count": "{high:.0f} errors",
     "gyro_clipping": "{high:.0f} samples clipped on an axis",
@@ -118,7 +118,7 @@ class Ulog(LibraryLog):
     magic = b"ULog\x01\x12\x35"
     refusal = "is no log of PX4"
     kinds = ("vehicle_imu", "sensor_gyro", "sensor_gyro_fifo")
-    settings = "PX4: file etc/logging/logger_topics.txt on the SD card with the line vehicle_imu"
+    settings = "on PX4, add the line vehicle_imu to etc/logging/logger_topics.txt on the SD card"
     one_imu = (
         "one IMU cannot be checked: this autopilot logged no other ({}). If the board has more, add the line"
         f" vehicle_imu to etc/logging/logger_topics.txt on the SD card ({SETTINGS}), and check that CAL_GYROn_PRIO"

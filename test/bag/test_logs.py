@@ -512,7 +512,7 @@ def test_a_log_ends_where_the_time_steps_back(tmp_path, kind, gps, monkeypatch):
 @pytest.mark.parametrize(
     ("kind", "setting"),
     [
-        ("IMU", "ArduPilot: LOG_BITMASK bit 18, Fast IMU"),
+        ("IMU", "on ArduPilot, set LOG_BITMASK bit 18"),
         ("sensor_gyro", "logger_topics.txt"),
     ],
 )
@@ -525,7 +525,7 @@ def test_a_log_ends_where_the_time_steps_back(tmp_path, kind, gps, monkeypatch):
         (
             18.0,
             slice(None),
-            "at 18 Hz; needed: two IMUs or more, each by itself, at 20 Hz or more",
+            "at 18 Hz; needed: two IMUs or more, each with 20 samples or more at 20 Hz or more",
         ),
         (100.0, np.arange(800) % 20 < 2, "at 10.1 Hz; needed: two IMUs"),
     ],
@@ -625,7 +625,7 @@ def test_instances_without_end_are_no_instances(tmp_path):
         (
             "a.bin",
             b"\xa3\x95\x80" * 900,
-            "has no IMU or GYR or IMT, it has 1 unknown: ",
+            "has no IMU or GYR or IMT, it has 1 unknown. ",
         ),
         (
             "a.ulg",

@@ -91,7 +91,7 @@ def test_what_has_no_two_imus_is_refused(tmp_path):
     for data, words in (
         (
             slow,
-            r"at 2 Hz; needed: two IMUs .* at 5 Hz or more, .* ArduPilot: SRn_RAW_SENS",
+            r"at 2 Hz; needed: two IMUs .* at 5 Hz or more. What to do: on ArduPilot, raise SRn_RAW_SENS",
         ),
         (raw, "one IMU cannot be checked: this autopilot sent no other"),
         (struct.pack(">Q", UTC // 1000) + beat + raw, "has no SCALED_IMU"),
