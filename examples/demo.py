@@ -145,10 +145,10 @@ def _introduction(
         f" {', '.join(units)}, three\naxes each. {fault.start:g} s after the start"
         f" {', '.join(sorted(struck))} goes wrong: the demo adds\n    {fault}\n"
         "The monitor should name that gyro, and no other. In the first turn, at 8 s, all gyros are\n"
-        "UNCHECKED for 0.3 s, but stay in use: a turn excites errors that rest does not show, as\n"
-        "of delays. Below: its residual (how far each gyro\n"
-        "is from what the others measure), its state, and the evidence for a fault, which\n"
-        "names a gyro when it reaches the threshold.\n"
+        "UNCHECKED for 0.3 s, but stay in use: a turn shows errors that rest hides, for example\n"
+        "delays. The table below has for each gyro: its residual (how far it is\n"
+        "from what the others measure) and its state. The evidence for a fault stands above it:\n"
+        "a gyro is named when the evidence reaches the threshold.\n"
     )
 
 

@@ -242,7 +242,9 @@ def judge(
     try:
         return _judged(path, flight, parameters, calibrated, reports)
     except FdiError as error:
-        return _failed(flight, str(error))
+        # The line begins with the path already.
+        words = str(error).removeprefix(str(path)).removeprefix(":").strip()
+        return _failed(flight, words)
     except (
         Exception
     ) as error:  # A defect met in one recording must not cost the others.

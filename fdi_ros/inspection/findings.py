@@ -94,12 +94,12 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
     between = " " if headline == "NEEDS" else ": "
     words = f"{headline}{between}{'; '.join(one.words for one in deciding)}"
     if headline in BESIDE_LOOKS and LOOK in by_headline:
-        # They may be the cause.
         looks = by_headline[LOOK]
-        deciding = [*deciding, *looks]
         words = (
             f"{words.removesuffix('.')}. Also: {'; '.join(one.words for one in looks)}"
         )
+        # They may be the cause, so they come first.
+        deciding = looks
     if advice := dict.fromkeys(one.advice for one in deciding if one.advice):
         words = f"{words.removesuffix('.')}. What to do: {'; '.join(advice)}"
     return Verdict(HEADLINES[headline], words)

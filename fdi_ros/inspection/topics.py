@@ -34,7 +34,7 @@ from fdi_ros.report.layout import (
     told,
 )
 from fdi_ros.system.files import NAME
-from fdi_ros.system.text import date_of, figures, shown
+from fdi_ros.system.text import date_of, figures, listed, shown
 
 #: intervals longer than this many usual ones are gaps
 GAP_INTERVALS = 3.0
@@ -418,11 +418,14 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
         Column(
             "quiet_noise",
             [one and one.quiet for one in gyros],
-            ("noise at its lowest",),
+            ("lowest noise",),
             noise,
         ),
         Column(
-            "moving_noise", [one and one.moving for one in gyros], ("in motion",), noise
+            "moving_noise",
+            [one and one.moving for one in gyros],
+            ("noise in motion",),
+            noise,
         ),
         Column("moving_share", [one and one.share for one in gyros]),
         Column("accelerometer_quiet_noise", [one and one.quiet for one in forces]),
@@ -441,7 +444,7 @@ def topics_text(
         if report.could_be_gyros and (words := troubles(report, unit))
     ]
     notes += [f"note: {line}\n" for line in damage]
-    units = "rate: Hz; longest gap: s"
+    units = "rate: Hz, by the median interval; longest gap: s"
     if any(report.could_be_gyros for report in reports):
         units += (
             f"; noise: standard deviation of one sample of each channel, {unit.name};"
@@ -499,14 +502,11 @@ def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
         ("not finite", report.not_finite),
         (beyond, report.beyond),
         ("at the end of the range", saturated),
-        ("one value for long", np.maximum(report.repeats.count - saturated, 0)),
+        ("one value for 1 s or more", np.maximum(report.repeats.count - saturated, 0)),
     ):
         counted = zip(report.places, counts.tolist(), strict=True)
-        words += (
-            [f"{why}: {' and '.join(f'{n} of {place}' for place, n in counted if n)}"]
-            if counts.any()
-            else []
-        )
+        lines = [f"{place} in {n}" for place, n in counted if n]
+        words += [f"{why}: {listed(lines)} messages"] if lines else []
     words += [f"{report.malformed} malformed"] if report.malformed else []
     words += [f"{report.backward} stamps do not increase"] if report.backward else []
     words += [burst_words(report)] if report.burst > 1 else []

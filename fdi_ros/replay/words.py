@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple
 from typing import Any
 
@@ -155,18 +155,34 @@ def notes(summary: Summary) -> list[str]:
         lines.append(
             f"{stream.disordered} messages not used: they were recorded out of order"
         )
-    for topic, counters in stream.alignment.items():
-        unused = ", ".join(
-            f"{UNUSED_COUNTERS.get(name, f'samples {name}')}: {n}"
-            for name, n in counters.items()
-            if n and name != "received"
-        )
-        lines += [f"{topic}: {unused}"] if unused else []
+    lines += _unused_words(stream.alignment)
     if missing := scores.samples - scores.samples_with_rate:
         lines.append(_rate_words(summary, missing))
     lines += stretch_words(summary.story)
     if summary.monitor.note:
         lines.append(f"at the end, {summary.monitor.note}")
+    return lines
+
+
+def _unused_words(alignment: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """Return lines on messages of each topic that were not used as they came."""
+    lines = []
+    silent = {"received"}
+    jumps = {counters.get("jumped", 0) for counters in alignment.values()}
+    if len(alignment) > 1 and len(jumps) == 1 and 0 not in jumps:
+        # Together they are ahead of nobody.
+        silent.add("jumped")
+        times = "once" if jumps == {1} else f"{jumps.pop()} times"
+        lines.append(
+            f"the stamps of all units jumped together, {times}: a gap, or their clocks were set"
+        )
+    for topic, counters in alignment.items():
+        unused = ", ".join(
+            f"{UNUSED_COUNTERS.get(name, f'samples {name}')}: {n}"
+            for name, n in counters.items()
+            if n and name not in silent
+        )
+        lines += [f"{topic}: {unused}"] if unused else []
     return lines
 
 
@@ -181,7 +197,7 @@ def _rate_words(summary: Summary, missing: int) -> str:
     later = summary.monitor.rate.missing_s
     if not later:
         return f"no fused rate in the first {of}, while the biases were learned"
-    return f"no fused rate in {of}, those at the start included, while the biases were learned"
+    return f"no fused rate in {of}, at first because the biases were being learned"
 
 
 def sample_rate_notes(rate: SampleRate) -> list[str]:
@@ -288,7 +304,7 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
     columns: dict[str, Callable[[Any], str]] = {
         "unit": lambda row: row[0].name,
         "delivered": lambda row: f"{100 * row[0].delivered:.0f} %",
-        "usual rate": lambda row: number(row[0].rate_hz, ".3g", " Hz"),
+        "messages per s": lambda row: number(row[0].rate_hz, ".3g"),
         "checked": lambda row: f"{100 * min(one.checked for one in row[1]):.0f} %",
         "spikes": lambda row: str(sum(one.spikes for one in row[1])),
         "at end of range": lambda row: (

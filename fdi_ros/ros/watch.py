@@ -209,9 +209,7 @@ class Watcher(Node):
             if kinds[0].endswith(f"/{kind.__name__}")
         }
         if len(topics) < len(self._callbacks):
-            return (
-                f"{monitor} is not configured: waiting for a lifecycle manager to do it"
-            )
+            return f"{monitor} is starting, or waits for a lifecycle manager"
         if topics != {kind: one.topic_name for kind, one in self._heard_on.items()}:
             for one in self._heard_on.values():
                 self.destroy_subscription(one)

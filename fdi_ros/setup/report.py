@@ -67,7 +67,7 @@ from fdi_ros.setup.run import (
     Tried,
     times_words,
 )
-from fdi_ros.system.text import LINE, figures, first_of, listed, shown
+from fdi_ros.system.text import LINE, figures, first_of, listed, shown, span
 
 #: uncertainty of the axes along a direction of the body from which they are not well
 #: shown
@@ -97,8 +97,8 @@ NOISE_HINT = (
     " level of the quietest windows; the monitor measures in flight what vibration adds."
 )
 FORCE_HINT = (
-    "Differences from what all accelerometers have in common, which is not seen; with standard errors (+-). The axes"
-    " of the gyros, of units at right angles, are nominal."
+    "Relative to the mean of all accelerometers, because errors that all share do not show. With standard errors (+-)."
+    " Nominal axes: those of the gyros, at right angles within a unit."
 )
 WARNINGS_HINT = (
     "Those in the first line decide the verdict; look at the others when you can."
@@ -128,11 +128,12 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     usual = np.median(found.moment, axis=0)
     words = f"axes, biases and noise, from {rest:.1f} s at rest and {result.duration - rest:.1f} s in motion"
     yield Finding(Role.FOUND, "time at rest", words, value=rest)
-    (least, most), (low, high) = (
-        (std.min() * factor, std.max() * factor) for std in (floor.std, usual)
+    lowest, median = (
+        span(std.min() * factor, std.max() * factor, ".2g")
+        for std in (floor.std, usual)
     )
-    words = f"noise_std {least:.2g} to {most:.2g} {name}, {_quietest(floor.share)};"
-    words += f" median with vibration {low:.2g} to {high:.2g}"
+    words = f"noise_std {lowest} {name}, {_quietest(floor.share)};"
+    words += f" median with vibration {median}"
     largest = int(floor.std.argmax())
     yield Finding(
         Role.FOUND,
@@ -177,7 +178,7 @@ def _quietest(share: float) -> str:
 def _position(axis: str, value: float, error: float) -> str:
     """Return a measured position in words, m: a value below its error is no number."""
     if abs(value) < error:
-        return f"{axis} 0 within {error:.1g}"
+        return f"{axis} below {error:.1g}"
     # As many digits as the first one of the error.
     digits = max(3, math.ceil(-math.log10(error)))
     return f"{axis} {value:.{digits}f} +- {error:.1g}"
@@ -297,12 +298,12 @@ def _found_forces(fit: AccelerometerFit) -> Iterator[Finding]:
     """Yield noise, biases and scale error of the accelerometers."""
     found = fit.estimate
     name = FORCES.name
-    low = found.floor.std.min()
-    high = found.floor.std.max()
     usual = np.median(found.moment, axis=0)
-    words = f"accelerometers: noise {low:.2g} to {high:.2g} {name},"
-    words += f" {_quietest(found.floor.share)}; median with vibration"
-    words += f" {usual.min():.2g} to {usual.max():.2g}"
+    lowest, median = (
+        span(std.min(), std.max(), ".2g") for std in (found.floor.std, usual)
+    )
+    words = f"accelerometers: noise {lowest} {name}, {_quietest(found.floor.share)};"
+    words += f" median with vibration {median}"
     largest = int(found.floor.std.argmax())
     noise = found.floor.std[largest]
     error = found.floor.error[largest]
@@ -590,7 +591,8 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         written = "The file has the settings that were given"
         if found.chosen:
             written = "The file has the measured mounts, and otherwise the settings of `fdi inspect`"
-        words = f"in {proof.source}, {found.kept}. {written}; the other figures below are not used"
+        words = f"in {proof.source}, {found.kept}. {written}; the other figures below are not used."
+        words += _isolation_words(tried, unit)
         yield Finding(warning, "proof", words, headline="NO BETTER THAN BEFORE")
     else:
         yield _usable(found, tried, unit)
@@ -611,19 +613,9 @@ def _usable(found: SetupResult, tried: Tried, unit: Unit) -> Finding:
         return Finding(Role.WORTH, "proof", words, headline="USABLE")
     if not biases:
         return Finding(Role.WORTH, "proof", words, headline="USABLE")
-    low, high = (f"{size * unit.factor:.3g}" for size in (SIZES[0], SIZES[-1]))
-    words += f" Of {biases} test faults added there ({low} to {high} {unit.name}),"
-    words += f" {isolated} were isolated."
+    words += _isolation_words(tried, unit)
     named, of = tried.isolated[FLOOR]
     if named < LEAST_NAMED * of:
-        words += f" Of {of} with {FLOOR * unit.factor:.3g} {unit.name}, {named} were isolated"
-        largest, among = tried.isolated[SIZES[-1]]
-        if largest < LEAST_NAMED * among:
-            words += f", and of {among} with {high} {unit.name}, {largest}: a faulty gyro may be"
-            words += " detected without being identified."
-        else:
-            words += ": expect to identify the faulty gyro only of larger faults."
-        headline = "USABLE FOR LARGE FAULTS ONLY"
         return Finding(
             Role.WARNING,
             "proof",
@@ -632,10 +624,33 @@ def _usable(found: SetupResult, tried: Tried, unit: Unit) -> Finding:
             named,
             None,
             LEAST_NAMED * of,
-            headline,
+            "USABLE FOR LARGE FAULTS ONLY",
             "reduce vibration, or record again with rest and turns about every axis",
         )
     return Finding(Role.WORTH, "proof", words, (), isolated, None, biases, "USABLE")
+
+
+def _isolation_words(tried: Tried, unit: Unit) -> str:
+    """Return how many test faults were isolated, and what to expect if few of `FLOOR` were."""
+    isolated, biases = tried.isolated_of
+    if not biases:
+        return ""
+    low, floor, high = (f"{x * unit.factor:.3g}" for x in (SIZES[0], FLOOR, SIZES[-1]))
+    words = f" Of {biases} test faults added there ({low} to {high} {unit.name}),"
+    if not isolated:
+        return f"{words} none was isolated: a faulty gyro may be detected without being identified."
+    words += f" {isolated} were isolated."
+    named, of = tried.isolated[FLOOR]
+    if named >= LEAST_NAMED * of:
+        return words
+    words += f" Of {of} with {floor} {unit.name}, {named} were isolated"
+    largest, among = tried.isolated[SIZES[-1]]
+    if largest >= LEAST_NAMED * among:
+        return f"{words}: expect to identify the faulty gyro only of larger faults."
+    words += (
+        f", and of {among} with {high} {unit.name}, {largest}: a faulty gyro may be"
+    )
+    return f"{words} detected without being identified."
 
 
 def _not_shown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
@@ -939,7 +954,11 @@ def _sections(
     warnings = lines_of(findings, Role.WARNING)
     sections = [
         Section("Warnings", WARNINGS_HINT if warnings else "", warnings),
-        Section("Not shown by this recording", "", lines_of(findings, Role.UNKNOWN)),
+        Section(
+            "Not shown by this recording, or assumed",
+            "",
+            lines_of(findings, Role.UNKNOWN),
+        ),
         _proof_section(found, hint, unit),
         Section("What to do next", "", steps),
     ]

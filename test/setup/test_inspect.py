@@ -118,7 +118,7 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
         [0, 0, 0],
     ]
     text = topics_text(reports, damage)
-    assert "one value for long: 150 of x and 200 of z" in text
+    assert "one value for 1 s or more: x in 150 and z in 200 messages" in text
     assert "1 malformed" in text
     assert "1 stamps do not increase" in " ".join(text.split())
 
@@ -169,7 +169,7 @@ def test_noise_in_motion_is_told_apart_from_that_at_rest_of_each_unit_and_writte
             report.segments.noise().moving, [0.05, 0.1, 0.05], rtol=0.1
         )
         assert report.segments.noise().share == pytest.approx(22 / 30, abs=0.04)
-    assert "not finite: 1 of x" in topics_text(reports, damage)
+    assert "not finite: x in 1 messages" in topics_text(reports, damage)
     assert [report.not_finite.tolist() for report in reports] == [[1, 0, 0], [0, 0, 0]]
     assert recording_text(reports, tmp_path / "bag.mcap").startswith(
         "bag.mcap: 30.0 s from "
@@ -239,7 +239,7 @@ def test_why_there_is_no_config_is_said_of_each_topic(tmp_path, fdi, refused):
     )
     shown = fdi("inspect", path).out
     assert shown.count("3 gyros, none with a rate") >= 2
-    all_of_them = "20 of x and 20 of y and 20 of z\n"
+    all_of_them = "x in 20, y in 20 and z in 20 messages\n"
     assert f"note: /nan: not finite: {all_of_them}" in shown
     assert f"note: /huge: beyond 1000000 rad/s: {all_of_them}" in shown
     made = tmp_path / "c.yaml"
