@@ -30,9 +30,11 @@ from fdi_ros.inspection.findings import Finding, Role, lines_of, verdict_of
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.report.layout import RADIANS
 from fdi_ros.setup.agreement import find_mounts
 from fdi_ros.setup.blocks import prepare
-from fdi_ros.setup.run import Proof, Tried
+from fdi_ros.setup.report import _worth
+from fdi_ros.setup.run import SIZES, Proof, Tried
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -508,3 +510,52 @@ def test_settings_from_heavy_vibration_are_for_large_faults_only(root, tmp_path,
     assert [pair for pair in pairs if abs(float(pair[0])) < float(pair[1])] == []
     noisy = "times the noise of the other units"
     assert (noisy in out) >= (noisy in fdi("replay", log, "--config", config).out)
+
+
+def test_a_unit_that_may_be_the_cause_is_advised_on_alone() -> None:
+    findings = [
+        Finding(
+            Role.WARNING,
+            "proof",
+            "few were isolated.",
+            headline="USABLE FOR LARGE FAULTS ONLY",
+            advice="reduce vibration",
+        ),
+        Finding(
+            Role.WARNING,
+            "health",
+            "imu_1 lost messages",
+            headline="USABLE, BUT LOOK",
+            advice="check imu_1",
+        ),
+    ]
+    assert verdict_of(findings).words == (
+        "USABLE FOR LARGE FAULTS ONLY: few were isolated. Also: imu_1 lost messages."
+        " What to do: check imu_1"
+    )
+
+
+def test_settings_no_better_than_before_do_not_hide_that_no_test_fault_was_isolated() -> (
+    None
+):
+    none = dict.fromkeys(SIZES, (0, 18))
+    found = SimpleNamespace(
+        disagree=None,
+        calibration=object(),
+        config=Config.from_file(ROOT / "config" / "two_imus.yaml"),
+        chosen=(),
+        kept="the new settings judge 90% of the samples instead of 92%",
+        proof=SimpleNamespace(
+            source="the last 37 s",
+            apart=True,
+            before=SimpleNamespace(
+                judged=1.0, declared={}, isolated=none, isolated_of=(0, 54)
+            ),
+        ),
+    )
+    (proof,) = _worth(found, RADIANS)
+    assert proof.headline == "NO BETTER THAN BEFORE"
+    assert proof.words.endswith(
+        "Of 54 test faults added there (0.03 to 0.3 rad/s), none was isolated: a faulty"
+        " gyro may be detected without being identified."
+    )
