@@ -30,13 +30,13 @@ from fdi_ros.compiling.compiled import (
 from fdi_ros.core.algebra import dot, invert
 from fdi_ros.detectors.naming import (
     FEW_CHECKS,
-    MISFIT,
     Inference,
-    explain,
+    explain_with_misfit,
     redundancy,
     set_mean,
     unexplained,
 )
+from fdi_ros.detectors.onset import explain_change, samples_of_change
 from fdi_ros.detectors.sums import (
     BLOCKS_PER_VALUE,
     KEPT,
@@ -113,6 +113,10 @@ left out, because the onset of a fault is no noise."""
 STEADY_RATIO = 9.0
 """Square of the mean since the onset over the noise of single samples, from which the values are
 those of a fault: a filter spreads the onset of a fault over some samples, which is no noise."""
+SUDDEN = 8.0  # log odds of a change at the onset, which no slow move explains
+SLOWLY = 2.5
+"""Time in which a healthy bias moves by `Constants.bias_move`, standard deviation, s. A thermal
+shock of 6 mrad/s in 5 s is 2.5 times as fast and changes by less than noise."""
 MOVE_TIME = 1.0
 """Age of a fault, s, from which it must exceed what healthy biases move in flight. In simulated
 thermal shocks of 6 mrad/s a healthy gyro is named in 17 of 48 flights without this, in 9
@@ -149,6 +153,7 @@ class Case:
     witnesses: Mask  # channels present when the suspects were found
     louder: Flag  # a channel has become noisier
     healthy_move: Real  # standard deviation of the move of each healthy bias since the onset, rad/s
+    sudden: Mask  # channels that the change at the onset names
     unsolved: Real  # time without an explaining hypothesis, less the time with one, s
     retry: Whole  # earliest sample at which a case may open again
     before: ErrorStates  # states when the case opened
@@ -457,6 +462,8 @@ def name_channels(params: Constants, state: State) -> None:
         # A mean across a gap belongs to different motion.
         size = min(size, kf.samples - kf.returned + 1)
     case.louder = fill_louder(params, state, size)
+    if case.isolated == 0 and case.healthy_move > 0.0:
+        find_sudden(params, kf, case)
     if explain_beside_moves(params, state, size):
         return
     case.next = kf.samples + max(size // RENAME, 1)
@@ -469,6 +476,20 @@ def name_channels(params: Constants, state: State) -> None:
     case.suspects = inference.union
     isolate(params, kf, case)
     leave_aside(params, state)
+
+
+@compiled
+def find_sudden(params: Constants, kf: Estimator, case: Case) -> None:
+    """Find the channels that explain the change at the onset: healthy biases move slowly."""
+    inference = case.inference
+    size = samples_of_change(params, kf, SLOWLY)
+    case.sudden = 0
+    if case.onset + size <= kf.samples + 1:
+        inference.moved = params.bias_move * size * params.period / SLOWLY
+        inference.may_shift = True
+        explained = explain_change(params, kf, inference, case.onset, size)
+        if explained and inference.fitted and inference.log_odds > SUDDEN:
+            case.sudden = inference.likeliest
 
 
 @compiled
@@ -494,6 +515,8 @@ def explain_beside_moves(params: Constants, state: State, size: int) -> bool:
         else:
             case.next = state.estimator.samples + 1
         return True
+    if case.sudden and inference.common == case.sudden:
+        case.healthy_move = 0.0
     if case.healthy_move > 0.0:
         may_be_shift = inference.may_be_shift
         inference.may_shift = False
@@ -621,22 +644,10 @@ def explain_case(
 ) -> None:
     """Explain the mean of the last ``size`` samples, where each bias may have moved by ``moved``, rad/s."""
     case.inference.moved = moved
-    explain_mean(params, kf, case.inference, size)
+    set_mean(params, kf, case.inference, size)
+    explain_with_misfit(params, case.inference)
     if lacks_witnesses(case):
         keep_suspects(case)
-
-
-@compiled
-def explain_mean(
-    params: Constants, kf: Estimator, inference: Inference, size: int
-) -> None:
-    """Explain the mean of the last ``size`` samples, with a model error in proportion to the fault."""
-    set_mean(params, kf, inference, size)
-    explain(params, inference)
-    misfit = MISFIT * inference.largest
-    for i in range(params.sensors.n):
-        inference.covariance[i, i] += misfit * misfit
-    explain(params, inference)
 
 
 @compiled

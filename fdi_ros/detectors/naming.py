@@ -102,6 +102,8 @@ class Inference:
     mask: Mask  # channels of the mean
     judged: Mask  # channels of the mean whose faults show
     before: Total  # sums of all samples before the mean
+    middle: Total  # sums of all samples before the onset
+    until: Total  # sums of all samples up to the end of the change at the onset
     y: Channels  # values less their estimated errors, rad/s
     covariance: Square  # M, (rad/s)^2
     louder: Channels  # variance of a sample since the onset beyond the learned one, (rad/s)^2
@@ -574,6 +576,16 @@ def explain(params: Constants, inference: Inference) -> None:
     if inference.may_shift:
         add_shifts(inference, n, params.largest_move)
     choose(inference, n, params.confidence)
+
+
+@compiled
+def explain_with_misfit(params: Constants, inference: Inference) -> None:
+    """Explain the mean with a model error in proportion to the fault."""
+    explain(params, inference)
+    misfit = MISFIT * inference.largest
+    for i in range(params.sensors.n):
+        inference.covariance[i, i] += misfit * misfit
+    explain(params, inference)
 
 
 @compiled
