@@ -67,6 +67,7 @@ any mean, so with full odds no fault would ever be named."""
 GAIN_STD, DELAY_STD = 0.1, 0.03
 """Standard deviations for a unit that is wrong as a whole: of its gain (a wrong range), and
 of its delay in s (a clock that was set, by 40 ms for instance)."""
+FEW_BLOCKS = 3  # the angular acceleration is that of three blocks
 # share of the samples that a channel must deliver before its mean counts
 LEAST_PRESENCE = 0.9
 # log odds that each free amplitude costs: its size may lie anywhere in four decades
@@ -225,12 +226,37 @@ def noise_of_mean(params: Constants, noise: Noise, i: int, size: int) -> float:
 
 
 @compiled
+def variance_by_turn(
+    params: Constants, kf: Estimator, inference: Inference, i: int, size: int
+) -> float:
+    """Return the variance of the mean of channel i by what no state describes of a turn, (rad/s)^2.
+
+    A late sample of a channel is off by the angular acceleration, and the mean of that is
+    the change of the rate over the mean, whatever is between. In a few blocks the change
+    is not known so well, and the peak counts.
+    """
+    place = params.layout.delays[params.unit[i]]
+    delay_variance = kf.states.p[place, place] if place >= 0 else 0.0
+    if size < FEW_BLOCKS * params.length:
+        swing = kf.peak_turn[i]
+        return kf.peak_extra[i] + delay_variance * swing * swing
+    timing_error = params.timing[i] * inference.angular_acceleration[i]
+    if place >= 0:
+        delay_variance += kf.states.x[place] * kf.states.x[place]
+    # The mean of the second derivative of the rate is the change of the first.
+    second_order = delay_variance * kf.peak_turn[i] / (size * params.period)
+    return (
+        timing_error * timing_error
+        + second_order * second_order
+        + kf.peak_unresolved[i] * params.length / size
+    )
+
+
+@compiled
 def add_noise(
     params: Constants, kf: Estimator, inference: Inference, size: int
 ) -> None:
     """Add noise and moves of the biases, and what delays and nonlinearity make in motion."""
-    # A delay leaves no trace in the mean of a turn that ends as it began.
-    part = min(1.0, 3.0 * params.length / size)
     moves = 1.0 if kf.noise.regime == MOTION else 0.0
     for i in range(params.sensors.n):
         noise = noise_of_mean(params, kf.noise, i, size)
@@ -238,14 +264,11 @@ def add_noise(
         speed = moves * (kf.total.speed[i] - inference.before.speed[i]) / size
         nonlinear_error = params.nonlinearity[i] * speed
         moved = inference.moved * inference.moved
-        inference.covariance[i, i] += (
-            noise + kf.peak_extra[i] * part + nonlinear_error * nonlinear_error
-        )
+        inference.covariance[i, i] += noise + nonlinear_error * nonlinear_error
         inference.covariance[i, i] += moved + kf.force_variance
-        place = params.layout.delays[params.unit[i]]
-        if place >= 0:
-            swing = moves * kf.peak_turn[i] * part
-            inference.covariance[i, i] += kf.states.p[place, place] * swing * swing
+        inference.covariance[i, i] += moves * variance_by_turn(
+            params, kf, inference, i, size
+        )
     add_displacement_of_mean(params, kf, inference.before, size, inference.covariance)
 
 

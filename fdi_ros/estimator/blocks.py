@@ -106,7 +106,7 @@ def update_angular_acceleration(params: Constants, kf: Estimator) -> None:
     for i in range(params.sensors.n):
         if kf.noise.regime == REST:
             kf.angular_acceleration[i] = 0.0
-            kf.extra[i] = 0.0
+            kf.extra[i] = kf.unresolved_variance[i] = 0.0
         else:
             update_extra_variance(params, kf, i)
 
@@ -132,13 +132,15 @@ def update_extra_variance(params: Constants, kf: Estimator, i: int) -> None:
     timing_error = params.timing[i] * surely_turns
     nonlinear_error = params.nonlinearity[i] * speed
     kf.extra[i] = timing_error * timing_error + nonlinear_error * nonlinear_error
+    kf.unresolved_variance[i] = 0.0
     place = params.layout.delays[params.unit[i]]
     if place < 0:
         return
     states = kf.states
     delay_square = states.p[place, place] + states.x[place] * states.x[place]
     second_order = 0.5 * delay_square * jerk if kf.turning else 0.0
-    kf.extra[i] += delay_square * (noise + kf.shaken) + second_order * second_order
+    kf.unresolved_variance[i] = delay_square * (noise + kf.shaken)
+    kf.extra[i] += kf.unresolved_variance[i] + second_order * second_order
 
 
 @compiled
@@ -386,6 +388,8 @@ def update_peaks(
     faded = PEAK * kf.peak_turn[i]
     kf.peak_turn[i] = turn if abs(turn) > abs(faded) else faded
     kf.peak_extra[i] = max(PEAK * kf.peak_extra[i], kf.extra[i])
+    faded = PEAK * kf.peak_unresolved[i]
+    kf.peak_unresolved[i] = max(faded, kf.unresolved_variance[i])
     speed = along(axis, kf.rates[0])
     nonlinear_error = params.nonlinearity[i] * speed if moves else 0.0
     faded = PEAK * kf.nonlinear_variance[i]

@@ -257,6 +257,8 @@ class Estimator:
     peak_turn: Channels  # lately largest, rad/s^2
     extra: Channels  # variance of a block beyond noise and states, (rad/s)^2
     peak_extra: Channels  # lately largest, (rad/s)^2
+    unresolved_variance: Channels  # part of `extra` by turns that blocks do not resolve
+    peak_unresolved: Channels  # lately largest, (rad/s)^2
     nonlinear_variance: Channels  # variance by nonlinearity, lately largest, (rad/s)^2
     displaced: Channels  # variance by unknown positions, lately largest, (rad/s)^2
     may_be_apart: Flag  # positions of accelerometers are not known
@@ -606,5 +608,6 @@ def forget_motion(kf: Estimator, n: int) -> None:
     kf.unseen = kf.samples > 0
     for i in range(n):
         kf.angular_acceleration[i] = kf.extra[i] = 0.0
+        kf.unresolved_variance[i] = 0.0
         kf.deviation[i] = kf.deviation_square[i] = 0.0
         kf.deviation_turn[i] = kf.turn_square[i] = 0.0
