@@ -101,9 +101,7 @@ def fill_change(
     moves = 1.0 if kf.noise.regime == MOTION else 0.0
     for a in range(3):
         rate = (until.rate[a] - middle.rate[a]) / second
-        inference.rate[a] = moves * (
-            rate - (middle.rate[a] - before.rate[a]) / first
-        )
+        inference.rate[a] = moves * (rate - (middle.rate[a] - before.rate[a]) / first)
         turn = (until.instant[a] - middle.instant[a]) / second
         turn -= (middle.instant[a] - before.instant[a]) / first
         inference.change[a] = moves * turn / params.period

@@ -32,6 +32,7 @@ from fdi_ros.detectors.naming import (
     add_shifts,
     add_units,
     explain,
+    variance_by_turn,
 )
 from fdi_ros.detectors.sequential import Sequential
 
@@ -202,3 +203,37 @@ def test_what_no_hypothesis_explains_blames_all(seed, n):
     limit = FIT + FIT_PER_CHECK * max(n - 3 - len(best), 0)
     if left @ left > 1.01 * limit:
         assert (mean.own["common"], mean.own["union"]) == (0, (1 << n) - 1)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    delay=st.floats(1e-4, 3e-2),
+    seconds=st.floats(0.2, 4.0),
+)
+def test_a_late_unit_is_off_in_a_mean_by_the_change_of_the_rate(seed, delay, seconds):
+    """The delay explains itself times that change. The rest stays within the standard deviation."""
+    rng = np.random.default_rng(seed)
+    detector = Sequential(
+        Geometry(np.vstack([np.eye(3), np.eye(3)]), units=["one"] * 3 + ["two"] * 3),
+        NoiseModel(0.003),
+        delay_std=0.02,
+    )
+    params, kf = detector.constants[0], detector.states[0]["estimator"]
+    rows = allocate(Inference)
+    t = np.linspace(0.0, seconds, 4001)
+    size, speed, phase = rng.uniform([0.1, 0.5, 0.0], [2.0, 6.0, 6.3])
+    rate, late = (size * np.sin(speed * (t + by) + phase) for by in (0.0, delay))
+    turn = (rate[-1] - rate[0]) / seconds
+    mean = np.trapezoid(late - rate, t) / seconds
+    place = params["layout"]["delays"][1]
+    kf["states"]["x"][place], kf["states"]["p"][place, place] = 0.0, delay**2
+    kf["peak_turn"][3] = size * speed
+    rows[0]["angular_acceleration"][3] = turn
+    samples = int(seconds / params["period"])
+    variance = variance_by_turn(params, kf, rows[0], 3, samples)
+    by_timing = (params["timing"][3] * turn) ** 2
+    # Third order: the peak of the third derivative.
+    third = delay**3 * size * speed**3 / 6
+    assert abs(mean - delay * turn) <= np.sqrt(variance - by_timing) + third
+    bound = delay**2 * size * speed / seconds
+    assert variance <= by_timing + 1.1 * bound**2

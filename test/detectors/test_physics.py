@@ -142,3 +142,31 @@ def test_biases_that_move_one_unit_after_another_are_no_fault(pipeline):
         output = judge(pipeline, t, z)
         assert 80.0 < first_named(output, t, 4) < 82.0
         assert not (np.delete(output.state, 4, axis=1) == ChannelState.FAULTY).any()
+
+
+def test_a_small_fault_that_begins_suddenly_is_no_slow_move():
+    """On a cone of six, 9 mrad/s at once are named within 3 s; 9 mrad/s within 5 s, as a healthy bias moves, never."""
+    cone = Pipeline.from_config(
+        Config.from_parameters(
+            {
+                "input": "channels",
+                "sample_rate": RATE,
+                "geometry.preset": "two_triad_cone",
+                "noise.noise_std": (NOISE,),
+                "bias.startup_bias_duration": 3.0,
+            }
+        )
+    )
+    for seed in range(4):
+        t, rate, noise = flight(seed, 50.0, 0.1)
+        healthy = rate @ cone.geometry.axes.T + noise[:, :6]
+        since = np.maximum(t - 40.0, 0.0)
+        for rises, limit in ((0.01, 43.0), (5.0, np.inf)):
+            z = healthy.copy()
+            z[:, seed] += 0.009 * np.minimum(since / rises, 1.0)
+            output = judge(cone, t, z)
+            named = first_named(output, t, seed)
+            assert 40.0 < named < limit if rises < 1.0 else named == np.inf
+            assert not (
+                np.delete(output.state, seed, axis=1) == ChannelState.FAULTY
+            ).any()
