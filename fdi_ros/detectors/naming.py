@@ -53,9 +53,9 @@ SHIFTS, SMALLEST_SHIFT = 5, 1.0 / 16.0
 `Constants.largest_move`. Each further size is twice as large, up to 40 mrad/s of gyros: a
 boost of 10 g moves a gyro of 2 mrad/s a g by 20, and at its end by as much again."""
 MOST_HYPOTHESES = (
-    MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 3 * MAX_UNITS + SHIFTS
+    MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 4 * MAX_UNITS + SHIFTS
 )
-"""Largest number of hypotheses: channels, pairs, three for each unit, shifts of all biases."""
+"""Largest number of hypotheses: channels, pairs, four for each unit, shifts of all biases."""
 COINCIDENCE = 0.1
 """Prior odds, against one channel, of all pairs with that channel and of each way in which
 any unit is wrong. The value is deliberately large. With three parallel gyros, the same
@@ -67,6 +67,10 @@ any mean, so with full odds no fault would ever be named."""
 GAIN_STD, DELAY_STD = 0.1, 0.03
 """Standard deviations for a unit that is wrong as a whole: of its gain (a wrong range), and
 of its delay in s (a clock that was set, by 40 ms for instance)."""
+WARMS_BY = 4.0
+"""Standard deviation of moves of all biases of one unit, over that of single biases: its temperature
+changes. Without this hypothesis, one channel of a unit whose three biases move is named where
+the pairs with it are likelier than the other one."""
 FEW_BLOCKS = 3  # the angular acceleration is that of three blocks
 # share of the samples that a channel must deliver before its mean counts
 LEAST_PRESENCE = 0.9
@@ -411,7 +415,7 @@ def add_channels(inference: Inference, n: int) -> None:
 
 @compiled
 def add_units(params: Constants, inference: Inference) -> None:
-    """Add each whole unit: any errors of its channels, its gain, its delay."""
+    """Add each whole unit: any errors of its channels, moves of its biases, its gain, its delay."""
     n = params.sensors.n
     axes = params.sensors.axes
     rate = inference.rate
@@ -434,6 +438,10 @@ def add_units(params: Constants, inference: Inference) -> None:
             inside,
             False,
         )
+        if inference.moved > 0.0:
+            std = WARMS_BY * inference.moved
+            odds = log_ratio(inference, n, count, std * std)
+            add(inference, n, count, prior + odds, inside, True)
         for way in range(2):
             std = GAIN_STD if way == 0 else DELAY_STD
             for i in range(n):
