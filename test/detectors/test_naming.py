@@ -237,3 +237,27 @@ def test_a_late_unit_is_off_in_a_mean_by_the_change_of_the_rate(seed, delay, sec
     assert abs(mean - delay * turn) <= np.sqrt(variance - by_timing) + third
     bound = delay**2 * size * speed / seconds
     assert variance <= by_timing + 1.1 * bound**2
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_unit_whose_three_biases_move_names_none_of_its_channels(seed):
+    """While biases may move, the pairs of a unit that warms have no channel in common that is faulty."""
+    rng = np.random.default_rng(seed)
+    units = ["one"] * 3 + ["two"] * 3 + ["three"] * 3 + ["four"] * 3
+    y = 0.0003 * rng.standard_normal(12)
+    y[3:6] += rng.choice([-1, 1], 3) * rng.uniform(0.004, 0.009, 3)
+    mean = Mean(
+        Geometry(np.tile(np.eye(3), (4, 1)), units=units),
+        y,
+        0.0016**2 * np.eye(12),
+        np.zeros(3),
+        np.zeros(3),
+    )
+    mean.own["moved"] = 0.0012
+    explain(mean.params, mean.own)
+    assert mean.own["common"] == 0
+    y[[3, 4]] = 0.0
+    y[5] = 0.03
+    mean.own["y"][:12] = y
+    explain(mean.params, mean.own)
+    assert mean.own["common"] == mask_of([5])
