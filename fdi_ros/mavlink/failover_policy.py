@@ -41,7 +41,8 @@ Rules, in this order at each tick
     3. Orders are sent until the autopilot reports the wanted state. An order to take an
        IMU out is sent only while rule 2 holds, so also each repetition needs a sound
        other IMU whose "in use" was reported within `FRESH`.
-    4. If the autopilot reports no IMU in use, all of ours go back.
+    4. If the autopilot reports no IMU in use, all of ours go back. A report within
+       `STALE_ANSWER` of our order "back" may be older than that order, and does not count.
 
 No bad IMU goes back to make room for a worse one that is not the last: while an IMU is
 out, its EKF lane runs on the first IMU in use, and would follow the one that came back.
@@ -344,7 +345,7 @@ def _release(
     is_heard = any(imu.delivers for imu in view.imus)
     none_left = all(
         memory.ours
-        or imu.use is False
+        or (imu.use is False and imu.heard - memory.back_sent >= STALE_ANSWER)
         or imu.stuck
         or (is_heard and has_stood(memory.dead_since, REACTION, now))
         for memory, imu in pairs

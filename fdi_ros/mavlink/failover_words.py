@@ -169,7 +169,9 @@ def imu_condition(
     is_out = memory.ours and memory.seen is False
     stays = is_out and not view.armed
     asked_back = memory.ours and not memory.held and memory.tries > QUICK_TRIES
-    is_long_apart = has_stood(notes[k].apart_since, UNNAMED, now)
+    is_odd = has_stood(notes[k].apart_since, UNNAMED, now) and is_odd_known(
+        view, settings
+    )
     is_near = imu.size < settings.min_size
     checks = (
         (has_stood(notes[k].bad_since, REACTION, now), Condition.DANGER),
@@ -185,7 +187,8 @@ def imu_condition(
         (is_out, Condition.OUT),
         (view.armed and memory.left_alone, Condition.LEFT_ALONE),
         (memory.seen is False, Condition.UNUSED),
-        (is_long_apart and is_odd_known(view, settings), Condition.APART),
+        # Where it agrees again, the one that it differed from was bad.
+        (is_odd and imu.agreed is None, Condition.APART),
         (memory.seen and is_near, Condition.FINE),
     )
     return next((condition for holds, condition in checks if holds), None)
@@ -250,8 +253,9 @@ def _note(
         apart_since = (note.apart_since or now) if in_use and is_off else None
         angle = 0.0 if is_anew else note.lane_angle
         source = view.imus[k if in_use else first]
-        # While two others are bad a healthy one is apart from both.
-        is_misled = is_apart(source, settings) and (source.named or not source.ok)
+        # While two others are bad a healthy one, or one of a lesser error, is apart from both.
+        is_bad_one = source.blamed or not (source.ok or source.named)
+        is_misled = is_apart(source, settings) and is_bad_one
         if view.armed and source.delivers and is_misled:
             angle += source.size * seconds
         elif angle < LOST_LANE:

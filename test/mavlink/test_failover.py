@@ -232,6 +232,39 @@ def test_two_bad_imus_are_both_out_and_the_last_one_stays(flying: Monitored) -> 
     assert "two IMUs or more agree again" in flying.texts
 
 
+def test_a_late_answer_puts_no_bad_imu_back_beside_the_one_that_healed(
+    flying: Monitored,
+) -> None:
+    """IMU 2 goes back for the last one; an answer from before that reports none in use."""
+    flying.fault(1, 0.3, seconds=4.0)
+    flying.fault(2, -0.3, seconds=4.0)
+    flying.fault(3, [0.5, 0.0, 0.0], (FAULTY, OK, OK), 8.0)
+    assert flying.in_use == [False, False, True]
+    orders = len(flying.autopilots[0].sets)
+    flying.heal(2, 6.0)
+    sent = {(name, value) for _, name, value in flying.autopilots[0].sets[orders:]}
+    assert sent == {("INS_USE2", 1.0), ("INS_USE3", 0.0)}
+    assert flying.in_use == [False, True, False]
+
+
+def test_a_harmless_error_is_no_lost_lane_and_no_odd_one_beside_a_worse(
+    tmp_path: Path,
+) -> None:
+    """IMU 2 is FAULTY for ever on z, and apart on x only from IMU 3, which fails and heals."""
+    autopilot = Autopilot("ardupilot", late_reads=80 * MS)
+    flying = Monitored(tmp_path, autopilot, limit=1).run(10.0)
+    autopilot.armed = True
+    flying.run(3.0)
+    flying.fault(2, [0.0, 0.0, 0.02], (OK, OK, FAULTY), 5.0)
+    flying.fault(1, 0.1, seconds=4.0)
+    assert flying.in_use == [False, True, True]
+    flying.fault(3, [0.8, 0.0, 0.0], (FAULTY, OK, OK), 4.9)
+    flying.heal(3, 4.0)
+    assert "IMU 3 faulty AND IN USE: land" in flying.texts
+    assert not any("lane" in text for text in flying.texts)
+    assert "IMU 2 differs from the others" not in flying.texts
+
+
 def test_with_a_limit_a_worse_imu_is_announced_and_stays(tmp_path: Path) -> None:
     autopilot = Autopilot("ardupilot")
     flying = Monitored(tmp_path, autopilot, limit=1).run(10.0)
