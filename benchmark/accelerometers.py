@@ -37,6 +37,7 @@ from fdi_ros.replay.run import assumed_config
 GRAVITY, FORCE_NOISE, FORCE_BIAS = 9.81, 0.15, 0.3  # m/s^2
 SCALE, MISALIGNMENT = 0.01, float(np.radians(1.0))
 RANGE = 156.9  # m/s^2
+LANDING = 50.0  # s: then white vibration ends
 MOUNTINGS = ("2 units", "3 units", "4 units")
 FIGURES = {
     "nees": ".2f",
@@ -131,6 +132,26 @@ def rectified(flight: Flight, size: float) -> None:
     lines(flight, 3.0, 41.0)
 
 
+def shaken(flight: Flight, size: float, alike: bool, moved: float) -> None:
+    """Move all biases by moved, m/s^2, while white vibration shakes the units alike or each channel alone, up to 50 s.
+
+    Biases follow the vibration at once, or within 2 or 5 s.
+    """
+    rng = flight.rng
+    length, n = flight.noise.shape
+    runs = running_at(flight.t) * (flight.t < LANDING)[:, np.newaxis]
+    slow = np.clip((flight.t - MOTORS) / rng.choice([0.5, 2.0, 5.0]), 0.0, 1.0)
+    own = rng.standard_normal((length, n))
+    if alike:
+        of_body = size * runs * rng.standard_normal((length, 3))
+        flight.force = flight.force + of_body
+        unequal = rng.normal(0, 0.05, n // 3)
+        flight.noise += np.tile(of_body, n // 3) * np.repeat(unequal, 3)
+        own *= 0.1
+    flight.noise += size * runs * own
+    flight.noise += moved * rng.standard_normal(n) * runs * slow[:, np.newaxis]
+
+
 def apart(flight: Flight, length: float, turns: float, known: bool) -> None:
     """Units up to length apart, m, in turns so many times as fast; their positions may be known."""
     units = len(flight.arms)
@@ -171,6 +192,17 @@ CONDITIONS: dict[str, tuple[Any, ...]] = {
     "body 5 m/s^2": (100.0, body, 5.0, 43.0),
     "body 20 m/s^2": (100.0, body, 20.0, 43.0),
     "rectified 0.2 m/s^2": (100.0, rectified, 0.2),
+    **{
+        f"{name} {size:g} m/s^2, rectified {moved:g}": (
+            100.0,
+            shaken,
+            size,
+            name == "shaken alike",
+            moved,
+        )
+        for name in ("shaken alike", "shaken apart")
+        for size, moved in ((1.0, 0.1), (1.0, 0.3), (5.0, 0.2), (5.0, 0.5))
+    },
     "arms 0.1 m": (100.0, apart, 0.1, 1.0, False),
     "arms 0.1 m, turns x3": (100.0, apart, 0.1, 3.0, False),
     "known arms 0.1 m, turns x3": (100.0, apart, 0.1, 3.0, True),

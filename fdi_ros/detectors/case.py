@@ -502,7 +502,7 @@ def explain_beside_moves(params: Constants, state: State, size: int) -> bool:
     """
     case = state.case
     inference = state.case.inference
-    inference.may_shift = case.isolated == 0 and params.bias_move > 0.0
+    inference.may_shift = case.isolated == 0 and params.largest_move > 0.0
     explain_case(params, state.estimator, case, size, 0.0)
     age = (state.estimator.samples - case.onset) * params.period
     shifted = inference.shift > 0.0 and inference.fitted and is_steady(params, state)
@@ -622,7 +622,7 @@ def gives_up(params: Constants, state: State, seconds: float) -> bool:
     unclear = inference.may_be_shift or not inference.fitted
     unsolved = case.isolated == 0 and unclear
     case.unsolved = max(case.unsolved + (seconds if unsolved else -seconds), 0.0)
-    if params.bias_move == 0.0 or case.unsolved < UNSOLVED:
+    if params.largest_move == 0.0 or case.unsolved < UNSOLVED:
         return False
     std = unexplained(inference, params.sensors.n)
     move_biases(params, kf, std, 0.0)

@@ -473,7 +473,8 @@ class Sequential(Detector):
         By which a healthy bias may move within seconds, standard deviation, rad/s: a
         fault has to be beyond that, unless it is sudden.
     largest_move
-        By which all healthy biases may move together within half a minute, rad/s.
+        By which all healthy biases may move together within half a minute, rad/s; 0: they
+        never do.
     g_sensitivity_std
         Standard deviation of the change of a bias with the specific force, where the
         samples have one, (rad/s)/(m/s^2).
@@ -504,7 +505,7 @@ class Sequential(Detector):
         confidence: float = 0.999,
         bias_walk: float | Sequence[float] = 5e-5,
         bias_move: float = 0.0,
-        largest_move: float = 0.04,
+        largest_move: float = 0.0,
         g_sensitivity_std: float = 0.0,
         delay_std: float = 0.001,
         gain_is_fault: bool = False,

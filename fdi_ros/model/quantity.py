@@ -35,7 +35,11 @@ class Quantity(NamedTuple):
     in none, and the IMU that warms in a crash is declared at 17 s and 21 s. Accelerometers: 0,
     as a fault of 0.3 m/s^2 would not be named."""
     largest_move: float
-    """By which all healthy biases may move together within half a minute, over the natural size."""
+    """By which all healthy biases may move together within half a minute, over the natural size.
+
+    Gyros warm, or feel motors and boosts. Accelerometers rectify vibration, and stop when it
+    ends: without such moves healthy ones are named in 26 of 120 simulated flights, with
+    them in 3."""
 
 
 RATE = Quantity("gyro", "rad/s", 1.0, False, math.inf, 0.06, 0.04)

@@ -153,10 +153,12 @@ def _build(
         option: getattr(settings, option) for option in accepted if option in known
     }
     delay_std = UNIT_DELAY if source_of(config).stamped else CHANNEL_DELAY
+    turn_on_std = config.bias.turn_on_std
     errors = {
         "bias_walk": config.noise.bias_walk,
-        "bias_move": quantity.bias_move * config.bias.turn_on_std,
-        "largest_move": quantity.largest_move,
+        "bias_move": quantity.bias_move * turn_on_std,
+        # With a turn-on error of 0 the biases are known, and stay so.
+        "largest_move": quantity.largest_move if turn_on_std > 0.0 else 0.0,
         "g_sensitivity_std": config.noise.g_sensitivity_std,
         "delay_std": delay_std,
         "gain_is_fault": quantity.gain_is_fault,

@@ -139,6 +139,49 @@ def test_the_fused_specific_force_is_as_far_off_as_its_covariance_says():
     assert 0.5 < np.mean(squares) < 2.0
 
 
+TAKE_OFF, LANDING = 800, 2000  # samples
+
+
+def rectified(seed, vibration, shift):
+    """A flight that shakes all units alike from take-off to landing, and moves every bias while it does, m/s^2."""
+    block, _ = flight(2400, seed=seed, scale=0.005, bias=0.1, size=0.5)
+    rng = np.random.default_rng(seed)
+    runs = np.zeros(2400)
+    runs[TAKE_OFF:LANDING] = 1.0
+    runs = np.convolve(runs, np.full(50, 0.02))[:2400, None]
+    body = np.tile(rng.normal(0, vibration, (2400, 3)), 3)
+    own = rng.normal(0, 0.1 * vibration, (2400, 9)) + rng.normal(0, shift, 9)
+    force = block.acceleration.z + runs * (body + own)
+    return replace(block, acceleration=Block(block.stamp, force))
+
+
+def named_in(output):
+    return [
+        output.channel_names[event.channel]
+        for event in output.events
+        if event.after == ChannelState.FAULTY
+    ]
+
+
+@pytest.mark.parametrize("seed", [3, 10, 11])
+@pytest.mark.parametrize(("vibration", "shift"), [(1.0, 0.2), (1.0, 0.3), (5.0, 0.5)])
+def test_no_accelerometer_is_named_where_all_rectify_vibration(vibration, shift, seed):
+    output = Pipeline(settings()).process(rectified(seed, vibration, shift))
+    assert named_in(output) == []
+
+
+@pytest.mark.parametrize("seed", [3, 10, 11])
+def test_a_fault_is_named_where_all_accelerometers_rectify_vibration(seed):
+    pipeline = Pipeline(settings())
+    pipeline.sense(range(3))
+    fault = "channel=imu_2.accel_y kind=bias size=3 start=14"
+    block = struck(rectified(seed, 1.0, 0.2), [fault], pipeline.channel_names)
+    output = pipeline.process(block)
+    assert named_in(output) == ["imu_2.accel_y"]
+    first = next(event for event in output.events if event.after == ChannelState.FAULTY)
+    assert (first.stamp - START) / 1e9 - 14 < 2.0
+
+
 def test_known_lever_arms_are_taken_off():
     block, _ = flight(600, arms=ARMS, size=4.0)
 
