@@ -19,7 +19,9 @@ REST_RATIO = (
 )
 # rad/s, of the rate at rest: rotation of the earth, vibration of a table
 REST_STD = 3e-4
-UNLEARNED = 0.003  # rad/s, largest bias uncertainty in the test: a larger mean rate may be a turn
+UNLEARNED = 0.003
+"""Largest uncertainty of the mean rate of the test, rad/s, from biases or from noise: beyond
+it a turn may look like a bias, and in loud noise any slow motion like rest."""
 # largest scatter of one second of blocks over noise: exceeded once in 1000 (72 degrees
 # of freedom)
 REST_CHI = 1.6
@@ -68,6 +70,7 @@ def update_rest(params: Constants, kf: Estimator) -> None:
     if kf.rest_count < REST_BLOCKS:
         return
     n = params.sensors.n
+    is_loud = False
     for a in range(3):
         variance = known = 0.0
         for i in range(n):
@@ -78,6 +81,7 @@ def update_rest(params: Constants, kf: Estimator) -> None:
                 for j in range(n):
                     part += kf.fused.gain[a, j] * kf.at.covariance[i, j]
                 known += gain * part
+        is_loud = is_loud or variance > REST_BLOCKS * UNLEARNED * UNLEARNED
         kf.rest_noise[a] = variance
         # While biases are uncertain a steady turn looks like biases.
         kf.rest_bias_variance[a] = min(known, UNLEARNED * UNLEARNED)
@@ -88,8 +92,8 @@ def update_rest(params: Constants, kf: Estimator) -> None:
         kf.rest_bias_variance,
         params.rest_std * params.rest_std,
     )
-    if kf.noise.regime_seconds[REST] > LONG_TIME:
-        # A hover may turn as slowly, but has more noise.
+    if kf.noise.regime_seconds[REST] > LONG_TIME or is_loud:
+        # A hover may turn as slowly, but has more noise than rest, or than is expected.
         for i in range(n):
             if (
                 kf.masks[1] >> i & 1

@@ -98,7 +98,11 @@ def update_shared(params: Constants, kf: Estimator) -> None:
 
 @compiled
 def update_covariance(params: Constants, kf: Estimator) -> None:
-    """Take the innovations about their half-second mean into R. Absent channels keep their rows."""
+    """Take the innovations about their half-second mean into R. Absent channels keep their variances.
+
+    Their covariances with the others fade by the root of what the variances of these
+    fade by: otherwise R would not be a covariance any more.
+    """
     shared = kf.shared
     n = params.sensors.n
     largest = 0.0
@@ -107,16 +111,18 @@ def update_covariance(params: Constants, kf: Estimator) -> None:
     half = params.length / params.adaptation_gain
     shared.count = min(shared.count + 1.0, MEMORY * half)
     share = min(1.0, (math.sqrt(FAR) / max(largest, 1.0)) ** 2)
+    fading = math.sqrt(1.0 - 1.0 / shared.count)
     for i in range(n):
         if shared.kept >> i & 1:
             innovation = kf.innovation[i] - shared.local[i]
             shared.local[i] += innovation / half
             shared.difference[i] = innovation
-            for j in range(i + 1):
-                if shared.kept >> j & 1:
-                    shared.outer[i, j] += (
-                        share * innovation * shared.difference[j] - shared.outer[i, j]
-                    ) / shared.count
+        for j in range(i + 1):
+            if shared.kept >> i & shared.kept >> j & 1:
+                product = share * shared.difference[i] * shared.difference[j]
+                shared.outer[i, j] += (product - shared.outer[i, j]) / shared.count
+            elif (shared.kept >> i | shared.kept >> j) & 1:
+                shared.outer[i, j] *= fading
 
 
 @compiled

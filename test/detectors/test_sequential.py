@@ -359,6 +359,42 @@ def test_noise_and_vibration_that_units_do_not_share_teach_no_delay(shown):
         assert abs(status.delays[1]) < 3.0 * status.delay_std[1]
 
 
+def test_shared_noise_stays_a_covariance_while_channels_are_missing():
+    """Two units oscillate, then one of their channels is missing and the others are quiet."""
+    seconds = np.arange(0.0, 8.0, 1.0 / RATE)
+    share = np.array([1, 2, 1, -2, 1, 1, 0, 0, 0])
+    vibration = 0.03 * np.sin(2 * np.pi * 7.0 * seconds) * (seconds < 5.0)
+    z = np.hstack([swing(seconds)] * 3) + SIGMA * white(1, len(seconds), 9)
+    z += np.outer(vibration, share)
+    z[seconds > 5.0, 1] = np.nan
+    pipeline = Pipeline.from_config(parallel(3, detector__name="sequential"))
+    pipeline.process(stamped(seconds, z))
+    shared = pipeline.detector.states[0]["estimator"]["shared"]
+    for name in ("outer", "line_covariance"):
+        # The lower triangle is read.
+        spectrum = np.linalg.eigvalsh(shared[name][:9, :9])
+        assert spectrum.min() > -1e-9 * spectrum.max(), name
+
+
+@pytest.mark.parametrize("hertz", [6.3, 9.7])
+def test_a_slow_motion_under_loud_noise_is_no_rest(hertz):
+    """A unit that oscillates by 0.4 rad/s hides how the body turns; no bias is learned of it."""
+    seconds = np.arange(0.0, 40.0, 1.0 / RATE)
+    pipeline = Pipeline.from_config(
+        parallel(2, detector__name="sequential", bias__startup_bias_duration=0.0)
+    )
+    for seed in range(2):
+        axis = np.random.default_rng(seed).standard_normal(3)
+        since = np.maximum(seconds - 20.0, 0.0)
+        z = np.hstack([swing(seconds, 0.04)] * 2) + SIGMA * white(seed, len(seconds))
+        loose = 0.4 * np.sin(2 * np.pi * hertz * since)
+        z[:, 3:] += np.outer(loose, axis / np.linalg.norm(axis))
+        pipeline.restart()
+        pipeline.process(stamped(seconds, z))
+        bias = pipeline.detector.states[0]["estimator"]["states"]["x"][:6]
+        assert np.abs(bias).max() < 0.001
+
+
 def test_units_may_be_listed_in_any_order():
     """The second and the third of three units, the third with vibration of its own."""
     seconds = np.arange(0.0, 8.0, 1.0 / RATE)
