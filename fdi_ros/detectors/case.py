@@ -121,6 +121,9 @@ MOVE_TIME = 1.0
 """Age of a fault, s, from which it must exceed what healthy biases move in flight. In simulated
 thermal shocks of 6 mrad/s a healthy gyro is named in 17 of 48 flights without this, in 9
 with 5 s, and in 2 with 1 s."""
+SLOW = 2.0
+"""Time from the onset to a case, s, from which the evidence has grown slowly, up to `WARMS`:
+a step of 0.02 rad/s opens a case within 0.6 s, and what grows for longer is no warming."""
 STARTS = 0.25  # s within which a boost or motors start
 UNSTEADY = 0.25
 """Largest variance of the error of a channel beside noise, over the square of its mean, that is
@@ -303,6 +306,7 @@ def open_case(params: Constants, state: State, least: float) -> None:
     case.unsolved = 0.0
     copy_states(params.layout, kf.states, case.before)
     since = (kf.samples - case.onset) * params.period
+    case.inference.slow = SLOW < since < WARMS
     before = kf.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
     if case.onset == kf.hole_sample + 1:
         before = kf.hole_at

@@ -16,6 +16,7 @@ from fdi_ros import Pipeline
 
 # For this import alone: a module there has the name of a folder of tests.
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmark"))
+import physics
 from trials import Asked
 from vibration import CONDITIONS, config_of, judged
 
@@ -73,3 +74,12 @@ def test_biases_that_all_move_are_followed(units):
         found = flown(units, name)
         assert found["nees"].mean() < 3.0, found
         assert found["ok"].mean() > 0.8, found
+
+
+def test_six_gyros_that_warm_name_none_of_them():
+    """Their biases move by 20 mrad/s in half a minute, which may look like a drift of one."""
+    label = "cone, 50 Hz, warming 20 mrad/s"
+    asked = Asked(seed=36)
+    pipeline = Pipeline.from_config(physics.config_of("cone", 50.0, {}, asked))
+    rng = asked.rng(label, 0)
+    assert not physics.fly(pipeline, "cone", "warming 20 mrad/s", 0.0, rng).wrong
