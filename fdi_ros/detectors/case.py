@@ -491,9 +491,12 @@ def find_sudden(params: Constants, kf: Estimator, case: Case) -> None:
     if case.onset + size <= kf.samples + 1:
         inference.moved = params.bias_move * size * params.period / SLOWLY
         inference.may_shift = True
+        slow = inference.slow
+        inference.slow = False
         explained = explain_change(params, kf, inference, case.onset, size)
         if explained and inference.fitted and inference.log_odds > SUDDEN:
             case.sudden = inference.likeliest
+        inference.slow = slow and not case.sudden
 
 
 @compiled
