@@ -67,7 +67,7 @@ any mean, so with full odds no fault would ever be named."""
 GAIN_STD, DELAY_STD = 0.1, 0.03
 """Standard deviations for a unit that is wrong as a whole: of its gain (a wrong range), and
 of its delay in s (a clock that was set, by 40 ms for instance)."""
-WARMS_BY = 4.0
+WARMS_BY = 3.0
 """Standard deviation of moves of all biases of one unit, over that of single biases: its temperature
 changes. Without this hypothesis, one channel of a unit whose three biases move is named where
 the pairs with it are likelier than the other one."""
