@@ -138,7 +138,7 @@ class Trouble(Enum):
         "judge only the part in flight (--start, --end), or record again, with rest at the start and"
         " less vibration"
     )
-    LEFT_OUT = "to judge {who}, complete its data, or name it in a config (--config)"
+    LEFT_OUT = "to judge {who} too, mend what is wrong, or choose the units in a config (--config)"
     DELIVERY = "check connection, driver and bus load of {who}"
     COPY = "give {who} a sensor of its own: check wiring and driver"
     DOUBT = "make a longer recording: the suspicion of {who} is still open"
@@ -147,8 +147,8 @@ class Trouble(Enum):
     SPIKES = "check wiring and power supply of {who}"
     NOISE = "check {who} for a loose mounting"
     REPEATS = (
-        "check the driver of {who} if the vehicle moved meanwhile; coarse values repeat at rest, so"
-        " judge only the part in flight (--start, --end)"
+        "check the driver of {who} if the vehicle moved meanwhile; at rest, coarse values repeat by"
+        " themselves"
     )
 
     def advice(self, who: Iterable[str]) -> str:
