@@ -306,7 +306,7 @@ def open_case(params: Constants, state: State, least: float) -> None:
     case.unsolved = 0.0
     copy_states(params.layout, kf.states, case.before)
     since = (kf.samples - case.onset) * params.period
-    case.inference.slow = SLOW < since < WARMS
+    case.inference.slow = params.bias_move > 0.0 and SLOW < since < WARMS
     before = kf.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
     if case.onset == kf.hole_sample + 1:
         before = kf.hole_at

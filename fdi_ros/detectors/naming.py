@@ -241,18 +241,22 @@ def variance_by_turn(
 
     A late sample of a channel is off by the angular acceleration, and the mean of that is
     the change of the rate over the mean, whatever is between. In a few blocks the change
-    is not known so well, and the peak counts.
+    is not known so well, and the peak counts. It counts, and fades, also for accelerometers,
+    because what they rectify of a vibration is no part of that change.
     """
+    moves = 1.0 if kf.noise.regime == MOTION else 0.0
     place = params.layout.delays[params.unit[i]]
     delay_variance = kf.states.p[place, place] if place >= 0 else 0.0
-    if size < FEW_BLOCKS * params.length:
-        swing = kf.peak_turn[i]
-        return kf.peak_extra[i] + delay_variance * swing * swing
+    swing = moves * kf.peak_turn[i]
+    rectifies = params.louder < math.inf
+    if rectifies or size < FEW_BLOCKS * params.length:
+        part = min(1.0, FEW_BLOCKS * params.length / size)
+        return part * (kf.peak_extra[i] + delay_variance * swing * swing)
     timing_error = params.timing[i] * inference.angular_acceleration[i]
     if place >= 0:
         delay_variance += kf.states.x[place] * kf.states.x[place]
     # The mean of the second derivative of the rate is the change of the first.
-    second_order = delay_variance * kf.peak_turn[i] / (size * params.period)
+    second_order = delay_variance * swing / (size * params.period)
     return (
         timing_error * timing_error
         + second_order * second_order
@@ -274,9 +278,7 @@ def add_noise(
         moved = inference.moved * inference.moved
         inference.covariance[i, i] += noise + nonlinear_error * nonlinear_error
         inference.covariance[i, i] += moved + kf.force_variance
-        inference.covariance[i, i] += moves * variance_by_turn(
-            params, kf, inference, i, size
-        )
+        inference.covariance[i, i] += variance_by_turn(params, kf, inference, i, size)
     add_displacement_of_mean(params, kf, inference.before, size, inference.covariance)
 
 

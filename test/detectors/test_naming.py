@@ -35,6 +35,7 @@ from fdi_ros.detectors.naming import (
     variance_by_turn,
 )
 from fdi_ros.detectors.sequential import Sequential
+from fdi_ros.estimator.noise import MOTION
 
 LARGEST = 0.04  # shift of all biases, rad/s
 
@@ -227,7 +228,7 @@ def test_a_late_unit_is_off_in_a_mean_by_the_change_of_the_rate(seed, delay, sec
     mean = np.trapezoid(late - rate, t) / seconds
     place = params["layout"]["delays"][1]
     kf["states"]["x"][place], kf["states"]["p"][place, place] = 0.0, delay**2
-    kf["peak_turn"][3] = size * speed
+    kf["noise"]["regime"], kf["peak_turn"][3] = MOTION, size * speed
     rows[0]["angular_acceleration"][3] = turn
     samples = int(seconds / params["period"])
     variance = variance_by_turn(params, kf, rows[0], 3, samples)
