@@ -43,7 +43,13 @@ from fdi_ros.estimator.error_states import (
     project,
     subtract_errors,
 )
-from fdi_ros.estimator.estimator import Constants, Estimator, Total, total_before
+from fdi_ros.estimator.estimator import (
+    FEWEST_BLOCKS,
+    Constants,
+    Estimator,
+    Total,
+    total_before,
+)
 from fdi_ros.estimator.noise import BLOCK, BURST_FACTOR, MOTION, Noise
 from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import Array
@@ -71,7 +77,6 @@ WARMS_BY = 3.0
 """Standard deviation of moves of all biases of one unit, over that of single biases: its temperature
 changes. Without this hypothesis, one channel of a unit whose three biases move is named where
 the pairs with it are likelier than the other one."""
-FEW_BLOCKS = 3  # the angular acceleration is that of three blocks
 # share of the samples that a channel must deliver before its mean counts
 LEAST_PRESENCE = 0.9
 # log odds that each free amplitude costs: its size may lie anywhere in four decades
@@ -249,8 +254,8 @@ def variance_by_turn(
     delay_variance = kf.states.p[place, place] if place >= 0 else 0.0
     swing = moves * kf.peak_turn[i]
     rectifies = params.louder < math.inf
-    if rectifies or size < FEW_BLOCKS * params.length:
-        part = min(1.0, FEW_BLOCKS * params.length / size)
+    if rectifies or size < FEWEST_BLOCKS * params.length:
+        part = min(1.0, FEWEST_BLOCKS * params.length / size)
         return part * (kf.peak_extra[i] + delay_variance * swing * swing)
     timing_error = params.timing[i] * inference.angular_acceleration[i]
     if place >= 0:

@@ -58,6 +58,7 @@ from fdi_ros.estimator.error_states import (
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
     BLOCKS_PER_COARSE,
+    FEWEST_BLOCKS,
     LONG_TIME,
     SNAPSHOT_TIME,
     Constants,
@@ -105,7 +106,6 @@ vehicle may move differently."""
 LEAST_SCALE, LEAST_TIMING, LEAST_NONLINEARITY = 1e-3, 3e-4, 3e-4
 """Smallest believable standard deviations of any channel, even a calibrated one: scale
 error, sampling instant in s, and nonlinearity."""
-FEWEST_BLOCKS = 3  # consecutive blocks from which the angular acceleration follows
 # Largest ratio of statistic to threshold that is published while there is no alarm.
 SHORT = 1.0 - 1e-9
 

@@ -67,6 +67,7 @@ BEGINS = 16.0
 SNAPSHOT_TIME, TIERS, SNAPSHOTS = 3.0 * BLOCK_TIME, 5, 8
 """s between snapshots (three blocks), tiers, snapshots per tier. Every eighth of a tier
 enters the next."""
+FEWEST_BLOCKS = 3  # consecutive blocks from which the angular acceleration follows
 REST_BLOCKS = round(1.0 / BLOCK_TIME)  # blocks without motion that are rest: a second
 BLOCKS_PER_COARSE = round(LONG_TIME / BLOCK_TIME)
 SAMPLES, BLOCKS, COARSE = (

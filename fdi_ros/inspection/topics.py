@@ -366,15 +366,12 @@ def recording_figures(
     }
 
 
-def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[Column]:
-    """Return columns of figures; those of values only for possible gyros."""
+def _noise_columns(reports: Sequence[TopicReport], unit: Unit) -> list[Column]:
+    """Return columns of noise: of possible gyros, and of accelerometers."""
     gyros = [
         report.segments.noise() if report.could_be_gyros else None for report in reports
     ]
     forces = [report.force_noise for report in reports]
-
-    def of_values(figure: Callable[[TopicReport], object]) -> list[object]:
-        return [figure(report) if report.could_be_gyros else None for report in reports]
 
     def noise(values: Array | None) -> str:
         if values is None or not np.isfinite(values).any():
@@ -383,6 +380,31 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
         if len(values) > 3:
             return f"{figures(np.nanmin(values), 2)} to {figures(np.nanmax(values), 2)}"
         return " ".join(figures(value, 2) for value in values)
+
+    return [
+        Column(
+            "quiet_noise",
+            [one and one.quiet for one in gyros],
+            ("lowest noise",),
+            noise,
+        ),
+        Column(
+            "moving_noise",
+            [one and one.moving for one in gyros],
+            ("noise in motion",),
+            noise,
+        ),
+        Column("moving_share", [one and one.share for one in gyros]),
+        Column("accelerometer_quiet_noise", [one and one.quiet for one in forces]),
+        Column("accelerometer_moving_noise", [one and one.moving for one in forces]),
+    ]
+
+
+def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[Column]:
+    """Return columns of figures; those of values only for possible gyros."""
+
+    def of_values(figure: Callable[[TopicReport], object]) -> list[object]:
+        return [figure(report) if report.could_be_gyros else None for report in reports]
 
     return [
         Column("name", [report.topic.name for report in reports], ("topic",), shown),
@@ -415,21 +437,7 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
         Column("stamps_not_increasing", of_values(lambda report: report.backward)),
         Column("stamps_ahead_s", of_values(lambda report: report.ahead)),
         Column("largest", of_values(lambda report: report.largest)),
-        Column(
-            "quiet_noise",
-            [one and one.quiet for one in gyros],
-            ("lowest noise",),
-            noise,
-        ),
-        Column(
-            "moving_noise",
-            [one and one.moving for one in gyros],
-            ("noise in motion",),
-            noise,
-        ),
-        Column("moving_share", [one and one.share for one in gyros]),
-        Column("accelerometer_quiet_noise", [one and one.quiet for one in forces]),
-        Column("accelerometer_moving_noise", [one and one.moving for one in forces]),
+        *_noise_columns(reports, unit),
         Column("", [_gyros(report, unit) for report in reports], ("content",)),
     ]
 

@@ -361,30 +361,25 @@ def _unit_concerns(units: Sequence[UnitHealth]) -> list[Concern]:
 def _alike(
     some: Sequence[ChannelHealth], word: Word, trouble: Trouble, words: str
 ) -> list[Concern]:
-    """Return one concern about all of some channels."""
-    return [Concern(word, trouble, tuple(one.name for one in some), words)]
+    """Return one concern about all of some channels, or none of no channels."""
+    names = tuple(one.name for one in some)
+    return [Concern(word, trouble, names, words)] if names else []
 
 
 def _unchecked(some: Sequence[ChannelHealth]) -> list[Concern]:
-    if not some:
-        return []
-    least = min(one.checked for one in some)
+    least = min((one.checked for one in some), default=0.0)
     words = f"could be checked in only {100 * least:.0f} % of the samples"
     return _alike(some, Word.CANNOT_TELL, Trouble.UNCHECKED, words)
 
 
 def _incomplete(some: Sequence[ChannelHealth]) -> list[Concern]:
-    if not some:
-        return []
-    least = min(one.delivered for one in some)
+    least = min((one.delivered for one in some), default=0.0)
     words = f"gave a value in only {100 * least:.0f} % of the samples"
     return _alike(some, Word.LOOK, Trouble.DELIVERY, words)
 
 
 def _at_end_of_range(some: Sequence[ChannelHealth]) -> list[Concern]:
-    if not some:
-        return []
-    longest = max(one.saturated_s for one in some)
+    longest = max((one.saturated_s for one in some), default=0.0)
     words = f"reached the end of the range for {figures(longest, 2)} s"
     return _alike(some, Word.LOOK, Trouble.END_OF_RANGE, words)
 
