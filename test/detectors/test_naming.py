@@ -171,7 +171,7 @@ def random_mean(seed, n):
     return Mean(geometry, y, covariance, rng.normal(0, 1, 3), rng.normal(0, 20, 3))
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([5, 6, 7, 9, 12]))
 def test_odds_are_those_of_normal_densities(seed, n):
     mean = random_mean(seed, n)

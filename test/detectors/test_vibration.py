@@ -22,7 +22,7 @@ from vibration import CONDITIONS, config_of, judged
 
 sys.path.pop(0)
 
-FLIGHTS = 3
+FLIGHTS = 2
 
 
 def flown(units, name):

@@ -23,6 +23,7 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.conditions import failures, parse_check
 from fdi_ros.replay.outcomes import GRACE
 from fdi_ros.replay.run import replay
+from fdi_ros.replay.sweep import judged_with, onsets_of
 from fdi_ros.replay.words import sentences
 from fdi_ros.report.layout import Severity
 
@@ -251,26 +252,37 @@ def test_shaken_to_saturation_it_declares_no_sound_channel(recording, units):
     assert counted == (np.abs(whole.z) >= 34.8).sum() > 100
 
 
+@pytest.fixture(scope="module")
+def onsets(block, units, calm):
+    """A monitor, and its memory 60 s into the rest and at the fastest turn, each with the 20 s that follow."""
+    seconds = (block.stamp - block.stamp[0]) / 1e9
+    speed = np.linalg.norm(calm.rate, axis=1)
+    rows = {
+        "rest": int(np.searchsorted(seconds, 60.0)),
+        "motion": int(np.nanargmax(speed)),
+    }
+    assert speed[rows["rest"]] < 0.02
+    assert speed[rows["motion"]] > 2.0
+    pipeline, names = Pipeline(units), sorted(rows, key=rows.__getitem__)
+    found = onsets_of(pipeline, block, [seconds[rows[name]] for name in names], 20.0)
+    return pipeline, dict(zip(names, found, strict=True))
+
+
 @pytest.mark.parametrize("when", ["rest", "motion"])
 @pytest.mark.parametrize(
     "channel", [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
 )
-def test_a_bias_on_any_one_channel_is_isolated(block, units, calm, channel, when):
-    seconds = (block.stamp - block.stamp[0]) / 1e9
-    speed = np.linalg.norm(calm.rate, axis=1)
-    moving = int(np.nanargmax(speed))
-    start = 60.0 if when == "rest" else seconds[moving]
-    at = int(np.searchsorted(seconds, start))
-    assert speed[at] > 2.0 if when == "motion" else speed[at] < 0.02
-    pipeline = Pipeline(units)
-    fault = parse_fault(f"channel={channel} kind=bias size=0.2 start={start:.9f}")
-    output = pipeline.process(Injector([fault], pipeline.channel_names).apply(block))
+def test_a_bias_on_any_one_channel_is_isolated(onsets, channel, when):
+    pipeline, onset = onsets[0], onsets[1][when]
+    fault = parse_fault(f"channel={channel} kind=bias size=0.2 start={onset.at:.9f}")
+    output = judged_with(pipeline, onset, fault)
     # In motion a unit that is wrong as a whole may explain it as well for a moment: then a set is declared first.
     named = [d for d in declared(pipeline, output) if d[1] == "FAULTY"]
     assert [d[0] for d in named] == [channel]
     assert not (output.state[-1] == ChannelState.AMBIGUOUS).any()
-    assert (named[0][2] - block.stamp[at]) / 1e9 <= (0.3 if when == "rest" else 1.0)
-    assert output.valid[at:].all()
+    delay = (named[0][2] - onset.block.stamp[onset.row]) / 1e9
+    assert 0.0 <= delay <= (0.3 if when == "rest" else 1.0)
+    assert output.valid.all()
 
 
 def test_faults_in_a_recording_of_real_units_are_found(root, recording, units):

@@ -335,7 +335,7 @@ def test_verb_writes_a_config_that_works(recording, tmp_path, fdi, refused):
         "--config",
         CONFIG / "three_imus.yaml",
         "--end",
-        180,
+        90,
     )
     code, out, _ = fdi(*words, "--output", output, "--report", report)
     assert code == 0
@@ -343,7 +343,7 @@ def test_verb_writes_a_config_that_works(recording, tmp_path, fdi, refused):
     assert re.search(r"^new +nothing +100% +18 of 18", out, re.MULTILINE)
     Pipeline.from_config(Config.from_file(output))
     assert "<h2>Proof</h2>" in report.read_text()
-    assert re.search(r"noise_std 0.0019 to 0.004\d* rad/s", out)
+    assert re.search(r"noise_std 0.0018 to 0.004\d* rad/s", out)
     assert "mounts:" not in output.read_text()
     assert "exists already" in refused(*words, "--output", output)
     # A former result is replaced where it is asked for, a file that a person wrote never is.

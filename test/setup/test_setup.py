@@ -498,7 +498,7 @@ def test_settings_from_heavy_vibration_are_for_large_faults_only(root, tmp_path,
     if not log.exists():
         pytest.skip(f"needs {log}, which is not here")
     config = tmp_path / "made.yaml"
-    code, out, _ = fdi("setup", log, "--output", config)
+    code, out, _ = fdi("setup", log, "--end", 40, "--output", config)
     first = out.splitlines()[0]
     assert code == 4
     assert first.startswith("USABLE FOR LARGE FAULTS ONLY: no false alarm in the last")
