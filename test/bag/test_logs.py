@@ -702,9 +702,9 @@ def test_of_a_default_log_of_px4_the_means_are_a_coarse_check(tmp_path):
 
 
 def test_a_default_log_shows_a_bias_and_no_more_than_that_is_said(tmp_path, fdi):
-    made, config = units(seconds=600.0, rate=1.0), tmp_path / "made.yaml"
+    made, config = units(seconds=300.0, rate=1.0), tmp_path / "made.yaml"
     for faulty in (False, True):
-        made[1].rate[300:, 1] += 0.1 * faulty
+        made[1].rate[150:, 1] += 0.1 * faulty
         path = log(tmp_path, "vehicle_imu_status", made)
         assert (
             "A COARSE CHECK" in fdi("inspect", path, "--output", config, "--force").out

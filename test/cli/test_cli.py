@@ -381,6 +381,8 @@ def test_verbs_need_no_more_than_is_compiled_ahead(flight, config, root, tmp_pat
             units,
             "--fault",
             "kind=bias size=0.1",
+            "--times",
+            1,
             "--end",
             25,
         ],

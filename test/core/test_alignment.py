@@ -119,7 +119,7 @@ def same(samples, blocks, units):
     np.testing.assert_array_equal(told, np.repeat(received(samples, units), 3, axis=1))
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(streams())
 def test_a_sample_holds_values_of_its_instant_each_once_and_none_is_left_out(case):
     units, messages = case
@@ -153,7 +153,7 @@ def test_a_sample_holds_values_of_its_instant_each_once_and_none_is_left_out(cas
     assert np.diff(stamps).min(initial=1 << 60) >= fastest > 0
 
 
-@settings(max_examples=25)
+@settings(max_examples=8)
 @given(streams(), st.lists(st.integers(-100_000, 100_000), min_size=4, max_size=4))
 def test_late_stamps_with_their_delays_are_the_stream_without_lateness(case, lateness):
     units, messages = case
@@ -176,7 +176,7 @@ def test_late_stamps_with_their_delays_are_the_stream_without_lateness(case, lat
     assert corrected.counters == right.counters
 
 
-@settings(max_examples=150)
+@settings(max_examples=50)
 @given(streams())
 def test_a_sample_comes_as_soon_as_every_live_unit_has_spoken_for_it(case):
     units, messages = case
@@ -197,7 +197,7 @@ def test_a_sample_comes_as_soon_as_every_live_unit_has_spoken_for_it(case):
             assert not [s for s in waiting(aligner, k)[1:] if s <= spoken]
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(streams(), st.lists(st.integers(0, 200), max_size=4))
 def test_a_recording_gives_the_samples_of_the_live_stream_wherever_it_is_cut(
     case, cuts
@@ -219,7 +219,7 @@ anything = st.one_of(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(
     st.lists(st.tuples(st.integers(0, 3), anything), max_size=120),
     st.sampled_from([(SKEW, TIMEOUT), (0, 1)]),

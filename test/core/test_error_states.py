@@ -103,7 +103,7 @@ class Measured:
         return self.x_and_p()
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 2**32 - 1), n=st.sampled_from([6, 9]))
 def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(seed, n):
     """The joint filter of states and rate, with a prior of the rate as wide as that of the elimination."""

@@ -157,7 +157,7 @@ def test_several_faults_at_once_act_one_after_the_other():
     np.testing.assert_array_equal(injected[:, 5], block.z[:, 5] + 0.5)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     kinds=st.lists(st.sampled_from(sorted(FAULT_KINDS)), min_size=1, max_size=4),
     cuts=st.lists(st.integers(0, 400), max_size=12),

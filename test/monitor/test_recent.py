@@ -99,7 +99,7 @@ def test_vibration_that_the_units_show_unequally_is_no_noise_of_one(vibration, n
 
 
 def test_a_slow_unit_is_named_with_both_rates_however_long_it_lasts():
-    steps = np.full((700, 3), SECOND)
+    steps = np.full((300, 3), SECOND)
     steps[30:, 1] = SECOND // 3
     health, pipeline = RecentHealth(), Pipeline(parallel(3))
     pipeline.process(healthy(2))
