@@ -211,22 +211,30 @@ def test_unpacked_files_of_a_killed_run_go_with_the_next(tmp_path, monkeypatch):
 INTERRUPTED = """
 import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
+for one in (signal.SIGTERM, signal.SIGHUP):
+    signal.signal(one, signal.SIG_DFL)
 from fdi_ros.cli.__main__ import fdi
 class Importer:
     def find_spec(name, path, target=None):
         if name == moment:
-            os.kill(os.getpid(), signal.SIGINT)
-moment = sys.argv.pop()
+            os.kill(os.getpid(), number)
+moment, number = sys.argv.pop(), int(sys.argv.pop())
 sys.meta_path.insert(0, Importer)
 sys.exit(fdi())
 """
 
 
 @pytest.mark.parametrize(
-    "moment",
-    ["fdi_ros.cli.command_line", "argparse", "numpy", "numba", "fdi_ros.replay.run"],
+    ("moment", "number"),
+    [
+        ("fdi_ros.cli.command_line", signal.SIGTERM),
+        ("argparse", signal.SIGINT),
+        ("numpy", signal.SIGHUP),
+        ("numba", signal.SIGTERM),
+        ("fdi_ros.replay.run", signal.SIGINT),
+    ],
 )
-def test_a_signal_while_it_is_loaded_is_no_traceback(moment, flight, config):
+def test_a_signal_while_it_is_loaded_is_no_traceback(moment, number, flight, config):
     words = [
         sys.executable,
         "-c",
@@ -235,6 +243,7 @@ def test_a_signal_while_it_is_loaded_is_no_traceback(moment, flight, config):
         flight,
         "--config",
         config,
+        int(number),
         moment,
     ]
     done = subprocess.run(

@@ -68,7 +68,7 @@ def test_the_worked_example_of_the_paper():
     ] == [(1, 2)]
 
 
-@pytest.mark.parametrize(("n", "trials"), [(5, 8), (6, 8), (7, 5), (9, 3)])
+@pytest.mark.parametrize(("n", "trials"), [(5, 5), (6, 4), (7, 3), (9, 3)])
 def test_intervals_and_culprits_are_those_of_linear_programmes(n, trials):
     rng = np.random.default_rng(n)
     for k in range(trials):
@@ -86,7 +86,7 @@ def test_intervals_and_culprits_are_those_of_linear_programmes(n, trials):
 
 def test_the_mildest_explanation_is_that_of_a_linear_programme():
     rng, compared = np.random.default_rng(20), 0
-    while compared < 12:
+    while compared < 6:
         geometry, bound = lopsided(rng, 6), rng.uniform(0.5, 2, 6)
         z = sample(rng, geometry, bound, int(rng.integers(3)))
         statistic = (

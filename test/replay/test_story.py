@@ -183,14 +183,14 @@ def test_a_sweep_tries_no_fault_in_a_gap(tmp_path, armings):
     block = read_block(
         two_armings(tmp_path / "sound.bin", logs.write_dataflash, faulty=False), config
     )
-    plan = Plan(parse_swept("kind=bias size=0.2"), times=9, within=5.0)
+    plan = Plan(parse_swept("kind=bias size=0.2"), times=6, within=5.0)
     (tried,) = sweep([Subject("all", config, block)], plan)
-    assert len(tried.times) == 9
+    assert len(tried.times) == 6
     assert tried.skipped == ()
     first, second = (
         [at for at in tried.times if (at > 50) == late] for late in (False, True)
     )
-    assert min(len(first), len(second)) >= 3
+    assert min(len(first), len(second)) >= 2
     assert max(first) + 5 <= ARMINGS[0] < ARMINGS[1] <= min(second)
     assert {trial.scored.outcome.value for trial in tried.trials} == {"named"}
     with pytest.raises(

@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the nodes need ROS 2")
 
-from bag.recordings import IMU, imu, write_mcap
+from bag.recordings import IMU, imu, imu_messages, write_mcap
 from diagnostic_msgs.msg import DiagnosticStatus
 from mcap.writer import Writer
 from ros.harness import RATE, TWO_IMUS, healthy, listening, stamps_of
@@ -43,12 +43,16 @@ FILE = ROOT / "config" / "two_imus.yaml"
 CONFIG = Config.from_file(FILE)
 
 
-def test_it_pauses_where_it_is_and_begins_anew_in_a_namespace(flight) -> None:
+def test_it_pauses_where_it_is_and_begins_anew_in_a_namespace(tmp_path: Path) -> None:
+    stamp = 10**18 + 10**7 * np.arange(3000)
+    recording = write_mcap(
+        tmp_path / "rest.mcap", imu_messages(stamp, np.zeros((3000, 6)), CONFIG.topics)
+    )
     with listening() as listener:
         heard, _ = (listener.hear(f"/drone/imu_{k}/data_raw") for k in (1, 2))
         remaps = ("__ns:=/drone", "/clock:=clock")
         with running(
-            "player_node", FILE, *remaps, bag=flight, rate=20.0, loop=True
+            "player_node", FILE, *remaps, bag=recording, rate=20.0, loop=True
         ) as playing:
             assert wait(lambda: len(heard) > 100, 2 * PATIENCE), playing.said()
             # The clock of one vehicle, if it is remapped so, is not that of all.

@@ -255,7 +255,7 @@ def test_clocks_that_share_no_instants_are_named(ahead, tmp_path, fdi, refused):
     assert words in said
 
 
-@pytest.mark.parametrize("odd", [0, 1, 2])
+@pytest.mark.parametrize("odd", [0, 2])
 def test_a_mirrored_unit_is_named_whatever_its_mount(odd, tmp_path, fdi):
     one = vehicle(0, "rest and turns", 3)
     z = one.block.z.copy()
