@@ -370,8 +370,17 @@ def test_verbs_need_no_more_than_is_compiled_ahead(flight, config, root, tmp_pat
             ["replay", flight, "--config", config, "--end", 4, "--detector", name]
             for name in here
         ),
-        ["replay", flight, "--config", units, "--output", tmp_path / "bag"],
-        ["setup", flight, "--output", out],
+        [
+            "replay",
+            flight,
+            "--config",
+            units,
+            "--end",
+            21,
+            "--output",
+            tmp_path / "bag",
+        ],
+        ["setup", flight, "--end", 40, "--output", out],
         ["inspect", flight],
         ["geometry", out],
         [
