@@ -473,7 +473,7 @@ def test_on_lopsided_axes_an_isolated_verdict_is_never_wrong(name, options):
     `recursive` is not asked: noise alone may make what it divides by small.
     """
     isolated = 0
-    for seed in range(30):
+    for seed in range(16):
         rng = np.random.default_rng(seed)
         detector = create_detector(
             name, random_axes(rng, 5 + seed % 4), CONSTANT, **options
@@ -494,7 +494,7 @@ def test_on_lopsided_axes_an_isolated_verdict_is_never_wrong(name, options):
             ).all()
             assert verdict.isolated[20:].all() or not detector.isolable[channel]
             isolated += bool(verdict.isolated[20:].all())
-    assert isolated > 60
+    assert isolated > 32
 
 
 REFUSED = [

@@ -174,7 +174,7 @@ def test_half_a_second_of_a_turn_makes_the_level_smaller(rate, name, share, most
     assert ratio.max() < most
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["cone", "parallel", "any"]))
 def test_the_level_of_a_sample_bounds_the_exact_one_and_is_it_where_all_errors_grow_alike(
     seed, mounting
