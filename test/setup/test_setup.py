@@ -486,6 +486,9 @@ def test_one_sensor_on_two_topics_is_no_redundancy(how, fdi, refused, tmp_path):
     assert (code, out.partition(":")[0]) == (3, "NEEDS A LOOK")
     assert f"/third gives the values of {TOPICS[0]}" in out.splitlines()[0]
     assert Config.from_file(tmp_path / "start.yaml").imus.topics == TOPICS
+    if how != "later":
+        # Setup begins with what was just inspected: the one that is hardest to see stands for all.
+        return
     code, out, _ = fdi("setup", bag, "--output", tmp_path / "own.yaml")
     assert code in (3, 4)
     assert f"/third gives the values of {TOPICS[0]}: one sensor on two topics" in out
