@@ -204,9 +204,11 @@ def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> int:
         return set(compress(functions, compiled))
 
     logged = progress_logged(set(functions), done) if functions else nullcontext()
+    # Where nothing is missing, all is only loaded: a second process would take longer to start.
+    workers = min(2, os.cpu_count() or 1) if functions else 1
     with (
         ProcessPoolExecutor(
-            min(2, os.cpu_count() or 1), spawned, _count_into, (functions, compiled)
+            workers, spawned, _count_into, (functions, compiled)
         ) as pool,
         logged,
     ):
