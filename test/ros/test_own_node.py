@@ -392,7 +392,7 @@ def test_what_is_odd_about_clocks_is_named_and_lived_with(tmp_path) -> None:
         assert listener.settle()
         time.sleep(1.0)
         listener.calm()
-        listener.play(healthy(500)[1])
+        listener.play(healthy(250)[1])
         for name in ("imu_1", "imu_2"):
             assert wait(
                 lambda name=name: listener.status(f"input {name}").message == "delivers"
@@ -400,7 +400,7 @@ def test_what_is_odd_about_clocks_is_named_and_lived_with(tmp_path) -> None:
 
         # Both far from now: the time begins anew when both units agree on it.
         listener.clear()
-        start, z = time.time_ns() - 3600 * 10**9, struck(1100, 300)[1]
+        start, z = time.time_ns() - 3600 * 10**9, struck(1000, 300)[1]
         listener.play(z[:300], start=start)
         assert listener.says("input imu_1", "behind the clock")
         assert wait(lambda: len(listener.fused) > 250)
