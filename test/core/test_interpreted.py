@@ -82,8 +82,8 @@ def digests():
     found = {
         "verdicts": verdicts(),
         # The third fault takes its time; what the other method adds is its votes.
-        "likelihood_ratio": flight("likelihood_ratio", 85),
-        "sequential": flight("sequential", 125),
+        "likelihood_ratio": flight("likelihood_ratio", 75),
+        "sequential": flight("sequential", 110),
     }
     return {name: list(one) for name, one in found.items()}
 
