@@ -139,7 +139,7 @@ def test_a_measurement_is_taken_as_by_a_filter_that_knows_nothing_of_the_rate(se
     )
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(seed=st.integers(0, 2**32 - 1), taken=st.floats(0.0, 1.2))
 def test_no_state_is_known_better_than_it_can_be_taught(seed, taken):
     """Least variances hold, and the covariance is that of the gain as cut: (I - D K) P (I - D K)' + D K M K' D."""
@@ -166,7 +166,7 @@ def test_no_state_is_known_better_than_it_can_be_taught(seed, taken):
     assert np.linalg.eigvalsh(p).min() > -1e-12
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(seconds=st.floats(0.01, 5000.0))
 def test_time_passes_as_in_the_linear_model(seconds):
     """The mean by the matrix exponential; that the steps are cut does not matter to it."""
@@ -227,7 +227,7 @@ def restamped(late, samples):
         yield found, out[:6].copy()
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(late=st.floats(-0.05, 0.05), rate=st.sampled_from([50.0, 100.0, 400.0, 1000.0]))
 def test_late_units_are_brought_to_one_instant(late, rate):
     """Straight lines in time come out as they went in: all of one instant, that of the latest unit."""

@@ -341,7 +341,7 @@ def fit(geometry, noise, z, a, *out):
     )
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 100_000), n=st.integers(4, 9), moving=st.booleans())
 def test_statistics_equal_weighted_least_squares(seed, n, moving):
     rng = np.random.default_rng(seed)
@@ -379,7 +379,7 @@ def test_true_channel_is_lost_no_more_often_than_the_confidence_says(
         assert lost < rows * (1 - confidence) + 3 * math.sqrt(rows * (1 - confidence))
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 100_000),
     n=st.integers(6, 8),

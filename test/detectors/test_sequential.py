@@ -109,7 +109,7 @@ def test_what_has_passed_is_forgotten():
     assert not alarm[-1]
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     size=st.floats(-1e7, 1e7),
     channel=st.integers(0, 5),
@@ -245,7 +245,7 @@ def test_noise_that_grows_fivefold_within_two_seconds_names_nobody():
         assert not measured().detect(growth * white(seed, 600)).isolated.any()
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(4, 12))
 def test_any_axes_without_alarm_for_20_s(seed, n):
     rng = np.random.default_rng(seed)

@@ -638,7 +638,7 @@ VALUES = st.lists(st.tuples(TEXTS, TEXTS), max_size=3).map(tuple)
 LINES = st.builds(StatusLine, st.sampled_from(Level), TEXTS, TEXTS, TEXTS, VALUES)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.lists(LINES, max_size=3), st.integers(0, 2**31 * 10**9 - 10**9))
 def test_diagnostics_are_the_bytes_of_rosbags(
     drawn: list[StatusLine], now: int

@@ -444,7 +444,7 @@ def test_more_events_than_are_written_down_at_once():
 
 
 @given(latch=st.booleans(), seed=st.integers(0, 1000))
-@settings(max_examples=20)
+@settings(max_examples=10)
 def test_states_follow_from_the_events(latch, seed):
     """Replaying the events gives the states: nothing changes without being told."""
     pipeline = Pipeline(parallel(3, decision__latch=latch, decision__clean_time=0.3))
@@ -550,7 +550,7 @@ def by_hand(sets, isolated, alarms, window):
     alarms=st.integers(1, 5),
     extra=st.integers(0, 5),
 )
-@settings(max_examples=150)
+@settings(max_examples=80)
 def test_first_declaration_is_the_one_found_by_hand(data, alarms, extra):
     decider, window = Decider(alarms, alarms + extra), alarms + extra
     expected = by_hand(*zip(*data, strict=True), alarms, window)

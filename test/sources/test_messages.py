@@ -183,7 +183,7 @@ class TestOneMessage:
 class TestManyMessages:
     """Read from one buffer, as they lie in a recording."""
 
-    @settings(max_examples=150)
+    @settings(max_examples=60)
     @given(drawn=imus)
     def test_imus_equal_what_others_deserialise(self, drawn) -> None:
         messages = [
@@ -201,7 +201,7 @@ class TestManyMessages:
             rate = true.angular_velocity
             assert same(decoded.values[k], [rate.x, rate.y, rate.z])
 
-    @settings(max_examples=150)
+    @settings(max_examples=60)
     @given(drawn=arrays)
     def test_arrays_equal_what_others_deserialise(self, drawn) -> None:
         messages = [
@@ -216,7 +216,7 @@ class TestManyMessages:
                 assert decoded.good[k] == (len(true) == channels)
                 assert not decoded.good[k] or same(decoded.values[k], true)
 
-    @settings(max_examples=150)
+    @settings(max_examples=60)
     @given(
         st.lists(
             st.tuples(st.binary(max_size=400) | st.none(), st.integers(0, 400)),
@@ -252,7 +252,7 @@ class TestManyMessages:
                 assert (decoded.good[k], decoded.stamp[k]) == (good, stamp)
                 assert same(decoded.values[k], values)
 
-    @settings(max_examples=200)
+    @settings(max_examples=80)
     @given(st.integers(0, 400), st.integers(0, 7), orders)
     def test_a_flipped_bit_never_reads_outside_the_message(
         self, byte, bit, order
