@@ -30,7 +30,7 @@ from fdi_ros.model.noise import much_noisier, noisier_words
 from fdi_ros.model.samples import LARGEST_GYRO_RANGE
 from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
-from fdi_ros.monitor.soundness import LEAST_DELIVERED, Trouble
+from fdi_ros.monitor.soundness import LEAST_DELIVERED, LEAST_SPIKES, Trouble
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.system.text import LINE, figures, first_of, listed, shown
 
@@ -353,7 +353,7 @@ def _slow_topics(chosen: Sequence[TopicReport]) -> Iterator[tuple[str, str]]:
 def bad_values(
     chosen: Sequence[TopicReport], headline: str = "READY, BUT LOOK"
 ) -> Iterator[Finding]:
-    """Yield gyros at the end of their range, and gyros that repeat one value for long."""
+    """Yield channels with spikes, and gyros at the end of their range or with old values."""
     saturated = [
         f"{shown(one.topic.name)} {place}"
         for one in chosen
@@ -367,6 +367,11 @@ def bad_values(
         words = f"{listed(saturated)} reached the end of the range for {figures(seconds, 2)} s"
         units = dict.fromkeys(name.partition(" ")[0] for name in saturated)
         yield _look("end of range", words, Trouble.END_OF_RANGE, list(units), headline)
+    for one in chosen:
+        name = one.topic.name
+        if spiky := _spike_words(one):
+            words = f"{shown(name)} has spikes of one sample: {listed(spiky)}"
+            yield _look("spikes", words, Trouble.SPIKES, (name,), headline)
     shares = {
         shown(one.topic.name): float(one.repeats.count.max()) / one.received
         for one in chosen
@@ -376,6 +381,17 @@ def bad_values(
         share = max(shares[name] for name in frozen)
         words = f"{listed(frozen)} repeat one value for long, in {share:.0%} of the messages"
         yield _look("frozen", words, Trouble.REPEATS, frozen, headline)
+
+
+def _spike_words(one: TopicReport) -> list[str]:
+    """Return the number of spikes of each channel that has at least `LEAST_SPIKES`."""
+    halves = (("", one.segments.spikes), ("accelerometer ", one.forces.spikes))
+    return [
+        f"{count} in {half}{place}"
+        for half, counts in halves
+        for place, count in zip(one.places, counts.tolist(), strict=True)
+        if count >= LEAST_SPIKES
+    ]
 
 
 def frozen_words(chosen: Sequence[TopicReport]) -> str:

@@ -12,12 +12,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from fdi_ros.config.settings import LEAST_NOISE
 from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
 from fdi_ros.estimator.noise import THREE_SIGMA
 from fdi_ros.estimator.rest import REST_STD, rests
-from fdi_ros.model.samples import Array, Int
+from fdi_ros.model.samples import Array, Int, Mask
 
 #: length of a segment, s; slow channels need longer ones to fill every block
 SEGMENT_LENGTH = BLOCK_TIME * REST_BLOCKS
@@ -34,6 +35,16 @@ VIBRATION_RATIO = 2.0
 LARGEST_BIAS = 0.1
 #: segments kept; longer recordings keep every second one, then every fourth
 MOST_SEGMENTS = 4096
+#: values before, and after, one that may be a spike
+SPIKE_REACH = 2
+#: distance of a spike from the median of the values around it, over the usual second
+#: difference of the values in its segment
+SPIKE_RATIO = 12.0
+#: the same over the range of the values around it. In 34 recordings without known spikes
+#: two values of a channel at most are beyond both, and four are with 7 in place of 10.
+SPIKE_ISOLATION = 10.0
+#: share of the values of a segment from which on values far off are no spikes
+FREQUENT = 0.1
 
 
 class NoiseSegment(NamedTuple):
@@ -64,6 +75,10 @@ class NoiseSegments:
         # Values (K, c) that do not make a segment yet, and their times, ns.
         self._waiting = np.empty((0, channels))
         self._times = np.empty(0, dtype=np.int64)
+        # Last values (at most `SPIKE_REACH`, c) of the segment before, without spikes.
+        self._before = np.empty((0, channels))
+        # Spikes (c,) in all segments so far.
+        self._spikes = np.zeros(channels, dtype=np.int64)
 
     def add(self, values: Array, times: Int, rate: float) -> None:
         """Take finite values (K, c), rad/s, at times (K,), ns.
@@ -77,16 +92,32 @@ class NoiseSegments:
             if rate
             else len(values) + 1
         )
-        full = len(values) // size * size
+        full = max(len(values) - SPIKE_REACH, 0) // size * size
         for k in range(0, full, size):
+            clean = self._without_spikes(values[k : k + size + SPIKE_REACH], size)
             if self._passed % self.every == 0:
-                self._kept.append(_segment(values[k : k + size], int(times[k])))
+                self._kept.append(_segment(clean, int(times[k])))
             self._passed += 1
             if len(self._kept) > MOST_SEGMENTS:
                 self._kept = self._kept[::2]
                 self.every = 2 * self.every
         self._waiting = values[full:]
         self._times = times[full:]
+
+    def _without_spikes(self, values: Array, size: int) -> Array:
+        """Return the first values (size, c) of some without their spikes, and count these."""
+        begin = len(self._before)
+        clean, spikes = without_spikes(np.vstack([self._before, values]))
+        self._spikes += spikes.sum(axis=0)
+        clean = clean[begin : begin + size]
+        self._before = clean[-SPIKE_REACH:]
+        return clean
+
+    @property
+    def spikes(self) -> Int:
+        """Number (c,) of single values far from those around them."""
+        _, spikes = without_spikes(np.vstack([self._before, self._waiting]))
+        return np.asarray(self._spikes + spikes.sum(axis=0))
 
     @property
     def empty(self) -> bool:
@@ -173,6 +204,33 @@ def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
             break
         quiet = alike
     return np.median(noise[quiet], axis=0), np.median(block[quiet], axis=0)
+
+
+def without_spikes(values: Array) -> tuple[Array, Mask]:
+    """Replace the spikes in values (N, c) by the median of the values around them.
+
+    Returns the values (N, c), and which of them were spikes. The first and last
+    `SPIKE_REACH` values are not examined.
+    """
+    spikes = np.zeros(values.shape, dtype=bool)
+    if len(values) <= 2 * SPIKE_REACH:
+        return values, spikes
+    around = np.delete(
+        sliding_window_view(values, 2 * SPIKE_REACH + 1, axis=0), SPIKE_REACH, axis=-1
+    )
+    median = np.median(around, axis=-1)
+    change = np.abs(values[1:-1] - 0.5 * (values[2:] + values[:-2]))
+    step = np.abs(np.diff(values, axis=0))
+    # Coarse values at rest mostly repeat. Then one step of theirs is usual.
+    least = np.where(step > 0.0, step, np.inf).min(axis=0)
+    usual = np.maximum(np.median(change, axis=0), least)
+    bound = np.maximum(SPIKE_RATIO * usual, SPIKE_ISOLATION * np.ptp(around, axis=-1))
+    inside = spikes[SPIKE_REACH:-SPIKE_REACH]
+    inside[:] = np.abs(values[SPIKE_REACH:-SPIKE_REACH] - median) > bound
+    spikes &= spikes.mean(axis=0) < FREQUENT
+    clean = values.copy()
+    clean[SPIKE_REACH:-SPIKE_REACH][inside] = median[inside]
+    return clean, spikes
 
 
 LARGEST_VALUE = 1e9

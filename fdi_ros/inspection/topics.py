@@ -436,6 +436,8 @@ def topic_columns(reports: Sequence[TopicReport], unit: Unit = RADIANS) -> list[
         Column("repeated", of_values(lambda report: report.repeats.count)),
         Column("stamps_not_increasing", of_values(lambda report: report.backward)),
         Column("stamps_ahead_s", of_values(lambda report: report.ahead)),
+        Column("spikes", of_values(lambda report: report.segments.spikes)),
+        Column("accelerometer_spikes", of_values(lambda report: report.forces.spikes)),
         Column("largest", of_values(lambda report: report.largest)),
         *_noise_columns(reports, unit),
         Column("", [_gyros(report, unit) for report in reports], ("content",)),
@@ -511,6 +513,8 @@ def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
         (beyond, report.beyond),
         ("at the end of the range", saturated),
         ("one value for 1 s or more", np.maximum(report.repeats.count - saturated, 0)),
+        ("spikes", report.segments.spikes),
+        ("spikes of the accelerometers", report.forces.spikes),
     ):
         counted = zip(report.places, counts.tolist(), strict=True)
         lines = [f"{place} in {n}" for place, n in counted if n]

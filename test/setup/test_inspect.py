@@ -48,6 +48,23 @@ def test_rates_gaps_and_noise_are_found(tmp_path):
     assert first.largest == pytest.approx(1.4, abs=0.2)
 
 
+@pytest.mark.parametrize("every", [41, 100, 330])
+def test_spikes_are_counted_and_are_no_noise(every, tmp_path):
+    """One channel has spikes of 0.3 to 5 rad/s of either sign, and noise of 0.002."""
+    messages, z = flight(6000)
+    struck = np.arange(30, 5990, every)
+    random = np.random.default_rng(1)
+    size = random.uniform(0.3, 5.0, len(struck)) * random.choice([-1, 1], len(struck))
+    z[struck, 1] += size
+    spiky = imu_messages(START + STEP * np.arange(len(z)), z, apart=1000)
+    clean, _ = inspect(write_mcap(tmp_path / "clean.mcap", messages))[0]
+    found, other = inspect(write_mcap(tmp_path / "spiky.mcap", spiky))[0]
+    for was, noise in zip(clean.segments.noise(), found.segments.noise(), strict=True):
+        np.testing.assert_allclose(noise, was, rtol=0.04)
+    assert found.segments.spikes.tolist() == [0, len(struck), 0]
+    assert not other.segments.spikes.any()
+
+
 def test_the_noise_of_accelerometers_is_found_where_there_are_any(tmp_path, fdi):
     """The second unit has none: its messages say so, or have zeros."""
     random = np.random.default_rng(0)
