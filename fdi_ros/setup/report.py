@@ -261,7 +261,7 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
             for a in poor
         )
         words = f"axes: too little rotation about {turns} of {body_frame}; the result stays near the configured axes."
-        words += " Turn the vehicle back and forth about these axes at about 1 rad/s"
+        words += f" Turn the vehicle back and forth about {listed(['xyz'[a] for a in poor])} at about 1 rad/s"
         yield Finding(
             Role.UNKNOWN,
             "axes",
