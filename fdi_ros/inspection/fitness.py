@@ -372,15 +372,24 @@ def bad_values(
         if spiky := _spike_words(one):
             words = f"{shown(name)} has spikes of one sample: {listed(spiky)}"
             yield _look("spikes", words, Trouble.SPIKES, (name,), headline)
-    shares = {
-        shown(one.topic.name): float(one.repeats.count.max()) / one.received
-        for one in chosen
-    }
-    frozen = [name for name, share in shares.items() if share >= MUCH_FROZEN]
+    frozen = {one.topic.name: _repeating(one) for one in chosen if _repeating(one)}
     if frozen and not saturated:
-        share = max(shares[name] for name in frozen)
-        words = f"{listed(frozen)} repeat one value for long, in {share:.0%} of the messages"
-        yield _look("frozen", words, Trouble.REPEATS, frozen, headline)
+        names = [name for some in frozen.values() for name in some]
+        share = max(float(one.repeats.count.max()) / one.received for one in chosen)
+        verb = "repeats" if len(names) == 1 else "repeat"
+        words = (
+            f"{listed(names)} {verb} one value for long, in {share:.0%} of the messages"
+        )
+        yield _look("frozen", words, Trouble.REPEATS, list(frozen), headline)
+
+
+def _repeating(one: TopicReport) -> list[str]:
+    """Return the channels that repeat one value in many messages, or the topic for all."""
+    name = shown(one.topic.name)
+    much = one.repeats.count >= MUCH_FROZEN * one.received
+    if much.all():
+        return [name]
+    return [f"{name} {place}" for place in np.array(one.places)[much].tolist()]
 
 
 def _spike_words(one: TopicReport) -> list[str]:

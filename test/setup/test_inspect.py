@@ -65,6 +65,20 @@ def test_spikes_are_counted_and_are_no_noise(every, tmp_path):
     assert not other.segments.spikes.any()
 
 
+@pytest.mark.parametrize(
+    ("stuck", "words"),
+    [
+        ([4], "/imu_2/data_raw y repeats one value"),
+        ([3, 4, 5], "/imu_2/data_raw repeats"),
+    ],
+)
+def test_the_channels_that_repeat_one_value_are_named(stuck, words, tmp_path, fdi):
+    _, z = flight(1000)
+    z[500:, stuck] = z[500, stuck]
+    messages = imu_messages(START + STEP * np.arange(len(z)), z)
+    assert words in fdi("inspect", write_mcap(tmp_path / "bag.mcap", messages)).out
+
+
 def test_the_noise_of_accelerometers_is_found_where_there_are_any(tmp_path, fdi):
     """The second unit has none: its messages say so, or have zeros."""
     random = np.random.default_rng(0)
