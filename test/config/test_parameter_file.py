@@ -44,7 +44,7 @@ VALUES = {
 }
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=50)
 @given(st.data())
 def test_what_is_written_is_read_as_the_same(data):
     names = data.draw(

@@ -153,7 +153,7 @@ def test_a_sample_holds_values_of_its_instant_each_once_and_none_is_left_out(cas
     assert np.diff(stamps).min(initial=1 << 60) >= fastest > 0
 
 
-@settings(max_examples=8)
+@settings(max_examples=12)
 @given(streams(), st.lists(st.integers(-100_000, 100_000), min_size=4, max_size=4))
 def test_late_stamps_with_their_delays_are_the_stream_without_lateness(case, lateness):
     units, messages = case
