@@ -29,6 +29,7 @@ from fdi_ros.mavlink.failover_ready import (
     INS_USE,
     Facts,
     doubt,
+    not_again,
     not_ready,
 )
 from fdi_ros.mavlink.failover_words import (
@@ -243,7 +244,7 @@ class Failover:
         view = self._view(now)
         facts = self._facts(view, now)
         if not self.out:
-            why = self._not_ready(view, facts, now)
+            why = not_ready(self._state.memories, view, facts, now, self._settings)
             return (Level.WARN, f"no failover: {why}") if why else (Level.OK, "ready")
         why = doubt(view, facts)
         asked = [k for k in self.out if self._state.memories[k].seen is True]
@@ -429,7 +430,8 @@ class Failover:
         """Return that failover is ready, or not any more and why, once that lasts."""
         facts = self._facts(view, now)
         is_out = bool(self.out)
-        why = doubt(view, facts) if is_out else self._not_ready(view, facts, now)
+        reason = not_again if is_out else not_ready
+        why = reason(self._state.memories, view, facts, now, self._settings)
         may_warn = view.armed and self._vehicle.in_reach
         self._readiness, words = self._readiness.hear(why, is_out, may_warn, now)
         return words
@@ -446,9 +448,6 @@ class Failover:
             has_lanes=self._lanes is not None,
             obeys=self._probe.obeys,
         )
-
-    def _not_ready(self, view: View, facts: Facts, now: int) -> str:
-        return not_ready(self._state.memories, view, facts, now, self._settings)
 
     def _is_slow(self, view: View, now: int) -> bool:
         """Return whether an IMU in use comes so slowly that vibration may look like an error."""

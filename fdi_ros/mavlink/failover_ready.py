@@ -10,7 +10,10 @@
     The same, and why a fault of some IMU might go unanswered. Failover is ready if there is
     no reason, so never while an IMU is out of use.
 
-In both the reasons stand in the order in which they count.
+`not_again`
+    Why, beside an IMU that is out of use, no other one could go out.
+
+The reasons stand in the order in which they count.
 """
 
 from __future__ import annotations
@@ -36,6 +39,7 @@ LARGEST_AGE = 1.0  #: Age of the newest judged sample from which the monitor is 
 LARGEST_LOSS = 0.1  #: Largest share of lost messages.
 LARGEST_READY_TRIP = 300 * MS  #: Longest round trip, ns.
 MONITOR_LATE = "the monitor is late"
+NO_OTHER = "no other IMU can go out of use"
 #: By whether the autopilot sets a parameter, as far as is known.
 ORDER_WORDS = {
     False: "the autopilot refuses {}",
@@ -85,6 +89,19 @@ def not_ready(
     return doubt(view, facts) or next(
         _reasons(memories, view, facts, now, settings), ""
     )
+
+
+def not_again(
+    memories: Sequence[Memory],
+    view: View,
+    facts: Facts,
+    now: int,
+    settings: PolicySettings,
+) -> str:
+    """Return why, beside an IMU that is out, no other one could go out. Empty: no reason."""
+    view = _without_late_answers(memories, view, now)
+    none_can = all(_objections(memories, view, now, settings))
+    return doubt(view, facts) or (NO_OTHER if none_can else "")
 
 
 def _reasons(

@@ -37,7 +37,7 @@ from fdi_ros.mavlink.failover_policy import (
     is_apart,
     is_bad,
 )
-from fdi_ros.mavlink.failover_ready import MONITOR_LATE
+from fdi_ros.mavlink.failover_ready import MONITOR_LATE, NO_OTHER
 from fdi_ros.mavlink.protocol import MS, NS
 from fdi_ros.mavlink.report import CRITICAL, INFO, TEXT_LENGTH, WARNING
 
@@ -74,19 +74,19 @@ class Condition(Enum):
     STUCK_OUT = Words(WARNING, "not back in use, though asked")
     REBOOT = Words(CRITICAL, "no notch: set INS_USE{} 1 and reboot")
     STAYS_OUT = Words(CRITICAL, "still faulty, stays out of use")
-    NOT_OK = Words(WARNING, "stays out, monitor finds it not OK")
+    NOT_OK = Words(WARNING, "stays out, monitor does not find it OK")
     UNTURNED = Words(WARNING, "stays out until turned by hand")
     OUT = Words(CRITICAL, "out of use", urgent=True)
     LEFT_ALONE = Words(WARNING, "left alone in this flight")
     UNUSED = Words(WARNING, "not in use, not by failover")
     APART = Words(WARNING, "differs from the others")
-    FINE = Words(INFO, "in use, differs no more")
+    FINE = Words(INFO, "in use, does not differ")
     # Of the vehicle.
     ALONE = Words(
         CRITICAL, "one IMU or none is alive: land", urgent=True, repeated=True
     )
     LAST_IMU = Words(CRITICAL, "one IMU left in use: land", urgent=True, repeated=True)
-    LAST_LANE = Words(CRITICAL, "one EKF lane left: land", repeated=True)
+    LAST_LANE = Words(CRITICAL, "one EKF lane or none left: land", repeated=True)
     DISAGREE = Words(CRITICAL, "the IMUs disagree: land", repeated=True)
     REDUNDANT = Words(INFO, "two IMUs or more agree again")
 
@@ -189,7 +189,7 @@ def imu_condition(
         (memory.seen is False, Condition.UNUSED),
         # Where it agrees again, the one that it differed from was bad.
         (is_odd and imu.agreed is None, Condition.APART),
-        (memory.seen and is_near, Condition.FINE),
+        (_is_in_use(memory) and is_near, Condition.FINE),
     )
     return next((condition for holds, condition in checks if holds), None)
 
@@ -212,7 +212,7 @@ def vehicle_condition(
     lanes = sum(angle < LOST_LANE for angle in angles)
     differs = any(has_stood(note.apart_since, UNNAMED, now) for note in notes)
     agreeing = [
-        imu.agreed is not None and memory.seen
+        imu.agreed is not None and _is_in_use(memory)
         for memory, imu in zip(memories, view.imus, strict=True)
     ]
     checks = (
@@ -223,9 +223,14 @@ def vehicle_condition(
             view.armed and differs and not is_odd_known(view, settings),
             Condition.DISAGREE,
         ),
-        (sum(map(bool, agreeing)) > 1, Condition.REDUNDANT),
+        (sum(agreeing) > 1, Condition.REDUNDANT),
     )
     return next((condition for holds, condition in checks if holds), None)
+
+
+def _is_in_use(memory: Memory) -> bool:
+    """Return whether an IMU is in use by all reports, and no order "out" is under way."""
+    return memory.seen is True and memory.against_since is None and not memory.held
 
 
 def _note(
@@ -272,6 +277,7 @@ class Readiness(NamedTuple):
     2. ``failover is ready`` once no reason has stood for that time: the first time, and
        after such a text. While an IMU is out of use: ``failover acts again``, only after
        such a text.
+    3. `NO_OTHER` is not announced: with the last IMU in use `LAST_IMU` is.
     """
 
     why: str | None = None  #: Present reason. Empty: none. None: not known yet.
@@ -287,8 +293,8 @@ class Readiness(NamedTuple):
         Parameters
         ----------
         why
-            Reason against failover: `failover_ready.not_ready`, or `failover_ready.doubt`
-            while an IMU is out of use, as that is announced by itself.
+            Reason against failover: `failover_ready.not_ready`, or, as an IMU that is out of
+            use is announced by itself, `failover_ready.not_again` while one is.
         is_out
             Whether one is.
         may_warn
@@ -300,7 +306,8 @@ class Readiness(NamedTuple):
         since = now if begins else self.since
         state = self._replace(why=why, since=since, may_warn=may_warn)
         stands = why == MONITOR_LATE or now - state.since >= ANNOUNCED_AFTER
-        is_news = may_warn if why else not (is_out and not self.announced)
+        warns = may_warn and why != NO_OTHER
+        is_news = warns if why else bool(self.announced) or not is_out
         if why == self.announced or not stands or not is_news:
             return state, None
         fine = "failover acts again" if is_out else "failover is ready"

@@ -196,7 +196,7 @@ def test_a_bad_imu_is_out_soon_and_back_two_seconds_after_it_agrees(
     assert flying.in_use == [False, True, True]
     flying.run(1.5)
     assert flying.in_use == [True, True, True]
-    assert flying.run(4.0).texts[-1] == "IMU 1 in use, differs no more"
+    assert flying.run(4.0).texts[-1] == "IMU 1 in use, does not differ"
     assert kept(flying, tmp_path, ()) == (1, [])
 
 
@@ -403,7 +403,7 @@ def test_no_fault_is_not_said_of_an_imu_that_differs(flying: Monitored) -> None:
     flying.fault(1, 0.0, [UNCHECKED] * 3, seconds=4.0)
     assert not any("no more" in text for text in flying.texts)
     flying.heal(2, 2.0)
-    assert "IMU 2 in use, differs no more" in flying.texts
+    assert "IMU 2 in use, does not differ" in flying.texts
 
 
 def shaken(
@@ -739,7 +739,7 @@ def test_one_lane_left_is_announced_and_a_short_hit_is_none(flying: Monitored) -
     for imu in (1, 2):
         flying.fault(imu, 2.5, seconds=1.5)
         flying.heal(imu, 1.0)
-    assert "one EKF lane left: land" in flying.texts
+    assert "one EKF lane or none left: land" in flying.texts
 
 
 def test_a_slow_disk_holds_up_no_order(
@@ -883,7 +883,7 @@ def test_a_gyro_that_is_still_faulty_stays_out_and_is_announced(
     autopilot.armed = False
     flying.fault(2, 0.0, [UNCHECKED] * 3, seconds=10.0)
     assert flying.in_use == [True, False, True], "not seen to be well"
-    assert flying.texts[-1] == "IMU 2 stays out, monitor finds it not OK"
+    assert flying.texts[-1] == "IMU 2 stays out, monitor does not find it OK"
     flying.heal(2, 10.0)
     assert flying.in_use == [True] * 3
 
@@ -924,7 +924,7 @@ def test_after_landing_an_imu_stays_out_until_it_has_agreed_while_turning(
     said = len(flying.texts)
     flying.run(8.0)
     assert flying.in_use == [True] * 3
-    assert flying.texts[said:] == ["IMU 2 in use, differs no more"]
+    assert flying.texts[said:] == ["IMU 2 in use, does not differ"]
 
 
 def test_a_doubt_from_before_an_imu_is_out_ends_in_words(flying: Monitored) -> None:
@@ -979,7 +979,7 @@ def test_a_condition_that_begins_in_a_gap_of_the_link_is_announced_after_it(
     flying.fault(2, 0.3, seconds=1.0)
     flying.autopilots[0].armed = False
     flying.fault(2, 0.05, (OK, SUSPECT, OK), seconds=4.0)
-    assert flying.texts[-1] == "IMU 2 stays out, monitor finds it not OK"
+    assert flying.texts[-1] == "IMU 2 stays out, monitor does not find it OK"
     flying.cut = True
     flying.fault(2, 0.05, seconds=1.5)
     flying.cut = False
@@ -1238,7 +1238,7 @@ def test_of_the_lanes_that_exist_the_last_one_is_announced(
         assert not any("lane" in text for text in talk.texts)
         talk.fault(imu, 2.5, seconds=1.5)
         talk.heal(imu, 1.0)
-    assert "one EKF lane left: land" in talk.texts
+    assert "one EKF lane or none left: land" in talk.texts
 
 
 def test_a_monitor_that_was_silent_is_believed_after_its_next_report(
@@ -1291,6 +1291,29 @@ def test_a_late_monitor_is_announced_while_an_imu_is_out(flying: Monitored) -> N
     assert flying.texts[-1] == "no failover: the monitor is late"
     flying.failover.age = 0.02
     assert flying.run(5.0).texts[-1] == "failover acts again"
+
+
+def test_failover_does_not_act_again_while_no_other_imu_can_go_out(
+    flying: Monitored,
+) -> None:
+    flying.fault(2, 0.3, seconds=2.0)
+    flying.failover.age = 1.5
+    flying.run(2.0)
+    flying.fault(3, 0.6, seconds=4.0)
+    flying.failover.age = 0.02
+    flying.run(8.0)
+    assert flying.in_use == [True, False, False]
+    said = flying.texts
+    assert said.count("no failover: the monitor is late") == 1
+    assert "failover acts again" not in said
+    # For a moment two are in use: the one that healed, and the last one.
+    flying.fault(1, [0.5, 0.0, 0.0], (FAULTY, OK, OK), 4.0)
+    flying.heal(3, 6.0)
+    assert flying.in_use == [False, False, True]
+    assert "failover acts again" not in flying.texts
+    flying.heal(1, 8.0)
+    assert flying.in_use == [True, False, True]
+    assert flying.texts.count("failover acts again") == 1
 
 
 # Words, file, recordings -----------------------------------------------------------------

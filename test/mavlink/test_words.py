@@ -17,6 +17,7 @@ from fdi_ros.mavlink.failover_policy import (
     PolicySettings,
     View,
 )
+from fdi_ros.mavlink.failover_ready import NO_OTHER
 from fdi_ros.mavlink.failover_words import (
     LOST_LANE,
     VEHICLE,
@@ -40,6 +41,7 @@ DOUBTED = GOOD._replace(ok=False)
 APART = DOUBTED._replace(size=0.1, agreed=None)
 OUT = Memory(ours=True, held=True, seen=False, out_sent=LONG_AGO + 1, tries=1, taken=1)
 USED = Memory(seen=True)
+DISPUTED = Memory(seen=True, against_since=NOW)
 
 
 def view(*imus: Imu, armed: bool = True, **given) -> View:
@@ -76,6 +78,9 @@ def view(*imus: Imu, armed: bool = True, **given) -> View:
         (None, replace(OUT, held=False), GOOD._replace(agreed=None), Note(), True),
         # Off, but not for long; of unknown size; not reported in use.
         (None, USED, APART, Note(apart_since=NOW - NS), True),
+        # In use, but the newest report says that it is not, or an order is under way.
+        (None, DISPUTED, GOOD, Note(), True),
+        (None, replace(OUT, seen=True), GOOD, Note(), True),
         (None, USED, GOOD._replace(size=math.nan), Note(), True),
         (None, Memory(), GOOD, Note(), True),
     ],
@@ -104,6 +109,7 @@ DEAD = Memory(seen=True, dead_since=0)
         (Condition.DISAGREE, (), (APART,) * 3, (LONG_APART,)),
         (Condition.REDUNDANT, (), (APART,), (LONG_APART,)),
         (None, (), (APART, APART), (LONG_APART,)),
+        (None, (DISPUTED,), (GOOD, APART), (Note(), LONG_APART)),
     ],
 )
 @pytest.mark.parametrize("armed", [True, False])
@@ -227,6 +233,24 @@ SLOW = "link is slow"
         (
             [(9.0, "", False, True), (9.0, SLOW, False, True), (9.0, "", True, True)],
             ["failover is ready", f"no failover: {SLOW}", "failover acts again"],
+        ),
+        # The pilot would take it for more with the last IMU in use, and that it is the last
+        # one is announced by itself.
+        (
+            [
+                (9.0, SLOW, True, True),
+                (9.0, NO_OTHER, True, True),
+                (2.9, "", True, True),
+            ],
+            [f"no failover: {SLOW}"],
+        ),
+        (
+            [
+                (9.0, SLOW, True, True),
+                (9.0, NO_OTHER, True, True),
+                (3.1, "", True, True),
+            ],
+            [f"no failover: {SLOW}", "failover acts again"],
         ),
         # Right after arming an order may end the reason.
         ([(9.0, SLOW, False, False), (2.9, SLOW, False, True)], []),

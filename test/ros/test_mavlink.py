@@ -169,7 +169,7 @@ def test_what_is_out_of_use_is_put_back_on_the_ground_if_the_monitor_reports_no_
     assert autopilot.parameters["INS_USE2"] == 0.0, "in flight it stays out"
     autopilot.armed = False
     with linked_over_udp(autopilot, **failover) as (ears, _):
-        told = (4, "FDI: IMU 2 stays out, monitor finds it not OK")
+        told = (4, "FDI: IMU 2 stays out, monitor does not find it OK")
         assert wait(lambda: told in autopilot.texts), autopilot.texts
     assert autopilot.parameters["INS_USE2"] == 0.0, "nothing is known of it"
     autopilot.texts.clear()
@@ -179,7 +179,7 @@ def test_what_is_out_of_use_is_put_back_on_the_ground_if_the_monitor_reports_no_
     ):
         assert ears.says("fdi_node: monitor", "9 of 9"), monitor.said()
         # A busy node may hear the monitor later than this process does.
-        silent = "monitor finds it not OK"
+        silent = "monitor does not find it OK"
         assert wait(lambda: any(silent not in text for _, text in autopilot.texts)), (
             process.said()
         )
