@@ -27,6 +27,7 @@ from fdi_ros.mavlink.failover_raw import (
     Difference,
     RawComparison,
     nearest_zero,
+    shift,
 )
 from fdi_ros.mavlink.protocol import MS, NS, Vector
 
@@ -171,6 +172,33 @@ def _note_names(track: Track, agreed: int | None, now: int) -> None:
     track.outdated = track.outdated & named
 
 
+def _compared(
+    difference: Difference, quick: Vector, scale: float, shifts: Vector
+) -> Compared:
+    """Return how far two IMUs are apart, less what scales and delays explain.
+
+    Parameters
+    ----------
+    difference
+        Their mean difference.
+    quick
+        Their smallest difference of late, by axis, rad/s.
+    scale
+        What scales explain, rad/s.
+    shifts
+        What delays explain, by axis, rad/s.
+    """
+    axes = []
+    for axis, mean in enumerate(difference.mean):
+        spread = difference.spread[axis]
+        size = max(0.0, abs(mean) - scale - shifts[axis])
+        is_wild = math.hypot(mean, spread) >= WILD_OSCILLATION + scale
+        is_steady = difference.steady[axis] or abs(quick[axis]) >= LARGE_DIFFERENCE
+        apart = size if is_steady else WILD_OSCILLATION if is_wild else 0.0
+        axes.append((apart, max(size, spread if spread >= CALM else 0.0), size))
+    return Compared(*zip(*axes, strict=True))
+
+
 class Evidence:
     """Joins the monitor's states and the raw comparison to an `Imu` for each IMU.
 
@@ -249,7 +277,7 @@ class Evidence:
             _note_names(track, agreed, now)
             faulty = track.axes(ChannelState.FAULTY)
             axes = faulty | accused if k == odd else faulty
-            if not self._is_odd(k, units):
+            if track.outdated and not self._is_odd(k, units):
                 axes = axes - (track.outdated - self._axes_off_again(k, units, now))
             blamed = any(track.sizes[axis] >= self._min_size for axis in axes)
             if k in out or blamed:
@@ -290,32 +318,21 @@ class Evidence:
 
     def _compare(self, units: Sequence[int], now: int) -> None:
         """Compare each pair of IMUs."""
+        rates = {k: self.raw.rate(k) for k in units}
+        gains = {k: self.raw.gain(k) for k in units}
         for j, k in combinations(units, 2):
             difference = self.raw.between(j, k, now)
             if difference is not None:
                 self._known_at[j, k] = now
-                found = self._compared(j, k, difference, now)
+                quick = self.raw.steady(j, k, now)
+                scale = SCALE * min(rates[j], rates[k])
+                found = _compared(difference, quick, scale, shift(gains[j], gains[k]))
             elif now - self._known_at.get((j, k), 0) > BREAK:
                 found = UNCOMPARED
             else:
                 # Of a lossy link: the last values hold.
                 continue
             self._pairs[j, k] = self._pairs[k, j] = found
-
-    def _compared(self, j: int, k: int, difference: Difference, now: int) -> Compared:
-        """Return how far two IMUs are apart, less what scales and delays explain."""
-        quick = self.raw.steady(j, k, now)
-        scale = SCALE * min(self.raw.rate(j), self.raw.rate(k))
-        shifts = self.raw.shift(j, k)
-        axes = []
-        for axis, mean in enumerate(difference.mean):
-            spread = difference.spread[axis]
-            size = max(0.0, abs(mean) - scale - shifts[axis])
-            is_wild = math.hypot(mean, spread) >= WILD_OSCILLATION + scale
-            is_steady = difference.steady[axis] or abs(quick[axis]) >= LARGE_DIFFERENCE
-            apart = size if is_steady else WILD_OSCILLATION if is_wild else 0.0
-            axes.append((apart, max(size, spread if spread >= CALM else 0.0), size))
-        return Compared(*zip(*axes, strict=True))
 
     def _note_trust(self, units: Sequence[int], now: int) -> None:
         """Note whether all IMUs agree, and which are apart from all others."""
@@ -494,7 +511,6 @@ class Evidence:
             others = [j for j in units if j != k]
             sizes = [self._pairs[k, j].apart for j in others]
             least = [min(one, other) for one, other in zip(*sizes, strict=True)]
-            steps = [self.raw.steps(j, self.raw.fewest) for j in others]
             vote = VOTE * self._min_size
             checks = (
                 (range(3) if self.raw.is_stuck(k) else (), self._min_size, SET_STANDS),
@@ -503,12 +519,9 @@ class Evidence:
             for doubted, size, stands in checks:
                 if axes := {axis for axis in doubted if least[axis] >= size}:
                     return k, axes, stands
-            axes = {
-                axis
-                for axis in self._tracks[k].axes(ChannelState.SUSPECT)
-                if least[axis] >= vote + max(step[axis] for step in steps)
-            }
-            if axes:
+            suspected = self._tracks[k].axes(ChannelState.SUSPECT)
+            axes = {axis for axis in suspected if least[axis] >= vote}
+            if axes := self._beyond_steps(axes, least, vote, others):
                 return k, axes, SUSPECT_STANDS
         sets = {k: self._tracks[k].axes(ChannelState.AMBIGUOUS) for k in units}
         found = [(k, axes, SET_STANDS) for k, axes in sets.items() if axes]
@@ -523,23 +536,29 @@ class Evidence:
 
         Farther than scales explain, and than the others turn within `SKEW`.
         """
-        first, second = (k for k in units if k != unit)
-        count = self.raw.fewest
-        turning = max(self.raw.rate(first), self.raw.rate(second))
+        others = [k for k in units if k != unit]
         least = LARGE_DIFFERENCE if self._tracks[unit].doubts else CLEAR_DIFFERENCE
-        limit = least + SCALE * turning
-        rows = zip(
-            self.raw.steady(unit, first, now),
-            self.raw.steady(unit, second, now),
-            self.raw.steps(first, count),
-            self.raw.steps(second, count),
-            strict=True,
-        )
-        return {
-            axis
-            for axis, (one, other, *steps) in enumerate(rows)
-            if abs(nearest_zero((one, other))) >= limit + max(steps)
-        }
+        rows = zip(*(self.raw.steady(unit, k, now) for k in others), strict=True)
+        sizes = [abs(nearest_zero(row)) for row in rows]
+        axes = {axis for axis, size in enumerate(sizes) if size >= least}
+        if not axes:
+            return axes
+        limit = least + SCALE * max(map(self.raw.rate, others))
+        return self._beyond_steps(axes, sizes, limit, others)
+
+    def _beyond_steps(
+        self,
+        axes: set[int],
+        sizes: Sequence[float],
+        limit: float,
+        others: Sequence[int],
+    ) -> set[int]:
+        """Return the axes with a size beyond a limit and what the others turn within `SKEW`."""
+        if not axes:
+            return axes
+        steps = [self.raw.steps(k, self.raw.fewest) for k in others]
+        bounds = [limit + max(step) for step in zip(*steps, strict=True)]
+        return {axis for axis in axes if sizes[axis] >= bounds[axis]}
 
     def error(self, unit: int, now: int) -> tuple[str, float] | None:
         """Return the axis on which an IMU is off most, and by how much, rad/s.

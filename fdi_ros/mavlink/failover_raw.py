@@ -10,9 +10,8 @@ link and a delay between two IMUs look like errors for a while.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
-from itertools import combinations, pairwise
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +52,7 @@ PROVEN_MOTION = 0.02  #: Change of rate that proves a motion, rad/s.
 NOISE = 4.0
 END_SAMPLES = 4  #: Samples averaged at the begin and at the end of that time.
 KEPT = 64  #: Samples kept of each IMU.
+PAIRS_KEPT = 256  #: Differences kept of each pair of IMUs.
 
 UNKNOWN_RATES: Vector = (math.nan, math.nan, math.nan)
 
@@ -69,6 +69,55 @@ class Difference(NamedTuple):
     def size(self) -> float:
         """Largest component, rad/s."""
         return max(map(abs, self.mean))
+
+
+class Rows:
+    """The last rates or differences with their times, oldest first, in arrays.
+
+    Parameters
+    ----------
+    kept
+        Largest number of rows.
+    """
+
+    def __init__(self, kept: int) -> None:
+        self._kept = kept
+        self._times = np.zeros(4 * kept, dtype=np.int64)
+        self._values = np.zeros((4 * kept, 3))
+        self._begin = self._end = 0
+
+    def __len__(self) -> int:
+        return self._end - self._begin
+
+    def append(self, time: int, values: Vector) -> None:
+        """Add a row: time in ns, values in rad/s."""
+        if self._end == len(self._times):
+            self._times[: len(self)] = self.times
+            self._values[: len(self)] = self.values
+            self._begin, self._end = 0, len(self)
+        self._times[self._end] = time
+        self._values[self._end] = values
+        self._end += 1
+        self._begin = max(self._begin, self._end - self._kept)
+
+    def drop(self, until: int) -> None:
+        """Drop the oldest rows up to a time, ns."""
+        while self._begin < self._end and self._times[self._begin] <= until:
+            self._begin += 1
+
+    @property
+    def times(self) -> np.ndarray:
+        """Times, ns."""
+        return self._times[self._begin : self._end]
+
+    @property
+    def values(self) -> np.ndarray:
+        """Rates or differences, one row each, rad/s."""
+        return self._values[self._begin : self._end]
+
+    def last(self, count: int) -> np.ndarray:
+        """Return the last count values, or as many as there are, rad/s."""
+        return self._values[max(self._begin, self._end - count) : self._end]
 
 
 class RawComparison:
@@ -92,10 +141,8 @@ class RawComparison:
         #: Fewest samples that are averaged, and the number of those within `QUICK`.
         self.fewest = max(FEWEST, QUICK // interval + 1)
         self._last: list[tuple[int, Vector]] = [(-NS, UNKNOWN_RATES)] * count
-        self._recent: list[deque[Vector]] = [deque(maxlen=KEPT) for _ in range(count)]
-        self._pairs: dict[tuple[int, int], deque[tuple[int, Vector]]] = {
-            (j, k): deque(maxlen=256) for k in range(count) for j in range(k)
-        }
+        self._recent = [Rows(KEPT) for _ in range(count)]
+        self._pairs = {(j, k): Rows(PAIRS_KEPT) for k in range(count) for j in range(k)}
         # Whether the differences of each pair are a wave, and of which first and last this
         # was judged.
         self._judged = dict.fromkeys(self._pairs, (0, 0))
@@ -125,7 +172,7 @@ class RawComparison:
             # At the second, the others have delivered theirs of the first.
             self._beside[unit] = [last for _, last in self._last]
         self._last[unit] = stamp, rate
-        self._recent[unit].append(rate)
+        self._recent[unit].append(stamp, rate)
         for other, same in enumerate(self._same):
             if other != unit and same >= self._repeating and not self._stuck[other]:
                 self._stuck[other] = self._is_left_behind(other)
@@ -135,9 +182,8 @@ class RawComparison:
             (first_stamp, first), (second_stamp, second) = (self._last[k] for k in pair)
             if abs(first_stamp - second_stamp) < self._reach:
                 x, y, z = (a - b for a, b in zip(first, second, strict=True))
-                rows.append((stamp, (x, y, z)))
-            while rows and rows[0][0] <= stamp - WINDOWS * AVERAGED:
-                rows.popleft()
+                rows.append(stamp, (x, y, z))
+            rows.drop(stamp - WINDOWS * AVERAGED)
 
     def _is_left_behind(self, unit: int) -> bool:
         """Return whether other IMUs have moved since an IMU repeats one value.
@@ -167,7 +213,7 @@ class RawComparison:
         From the first to the last `END_SAMPLES` of its last count samples.
         """
         # The oldest may be from before: IMUs are fed in turn.
-        rates = np.array(list(self._recent[unit])[2 - count :])
+        rates = self._recent[unit].last(count - 2)
         if len(rates) < 2 * END_SAMPLES:
             return 0.0, 0.0, 0.0
         noise = np.std(np.diff(rates, axis=0)) / math.sqrt(END_SAMPLES)
@@ -177,43 +223,34 @@ class RawComparison:
         x, y, z = change.tolist()
         return x, y, z
 
-    def _rates(self, unit: int) -> list[Vector]:
-        """Return the rates of an IMU within `AVERAGED`, rad/s."""
-        return list(self._recent[unit])[-self._averaged :]
+    def _rates(self, unit: int, periods: int = 1) -> np.ndarray:
+        """Return the rates of an IMU within so many times `AVERAGED`, rad/s. NaN: none."""
+        rates = self._recent[unit].last(periods * self._averaged)
+        return rates if len(rates) else np.array([UNKNOWN_RATES])
 
     def rate(self, unit: int) -> float:
         """Return the largest rate of an IMU within `AVERAGED`, rad/s."""
+        return max(math.hypot(*rate) for rate in self._rates(unit).tolist())
+
+    def gain(self, unit: int) -> Vector:
+        """Return by how much the rate of an IMU has grown within `AVERAGED`, by axis, rad/s."""
         rates = self._rates(unit)
-        return max(math.hypot(*rate) for rate in rates) if rates else math.nan
-
-    def shift(self, unit: int, other: int) -> Vector:
-        """Return the mean difference of two healthy IMUs that measure `USUAL_SKEW` apart.
-
-        By axis, rad/s: of the rate that both gain, or both lose, within `AVERAGED`.
-        """
-        gains = []
-        for k in (unit, other):
-            rates = self._rates(k)
-            ends = zip(rates[0], rates[-1], strict=True)
-            gains.append([last - first for first, last in ends])
-        share = USUAL_SKEW / AVERAGED
-        x, y, z = (share * abs(nearest_zero(pair)) for pair in zip(*gains, strict=True))
+        x, y, z = (rates[-1] - rates[0]).tolist()
         return x, y, z
 
     def turn(self, unit: int) -> Vector:
         """Return the mean rate of an IMU within `AVERAGED`, rad/s: that of a turn."""
-        x, y, z = _mean(np.array(self._rates(unit) or [UNKNOWN_RATES])).tolist()
+        x, y, z = _mean(self._rates(unit)).tolist()
         return x, y, z
 
     def shake(self, unit: int) -> Vector:
         """Return the standard deviation of the rate of an IMU within `AVERAGED`, rad/s."""
-        x, y, z = np.std(self._rates(unit) or [UNKNOWN_RATES], axis=0).tolist()
+        x, y, z = np.std(self._rates(unit), axis=0).tolist()
         return x, y, z
 
     def peaks(self, unit: int) -> Vector:
         """Return the largest rate of an IMU within twice `AVERAGED`, by axis, rad/s."""
-        rates = list(self._recent[unit])[-2 * self._averaged :] or [UNKNOWN_RATES]
-        x, y, z = np.abs(rates).max(axis=0).tolist()
+        x, y, z = np.abs(self._rates(unit, periods=2)).max(axis=0).tolist()
         return x, y, z
 
     def is_stuck(self, unit: int) -> bool:
@@ -222,7 +259,8 @@ class RawComparison:
 
     def repeats(self, unit: int, count: int) -> bool:
         """Return whether the last count samples of an IMU are all the same."""
-        return len(set(list(self._recent[unit])[-count:])) < 2
+        rates = self._recent[unit].last(count)
+        return bool((rates == rates[:1]).all())
 
     def steps(self, unit: int, count: int) -> Vector:
         """Return how far each axis of an IMU changed within `SKEW`, rad/s.
@@ -230,13 +268,10 @@ class RawComparison:
         The largest change among the last count samples. A healthy IMU that measures this
         much earlier or later differs by as much.
         """
-        rates = list(self._recent[unit])[-count - self._lag :]
-        largest = [0.0, 0.0, 0.0]
-        for before, after in zip(rates, rates[self._lag :], strict=False):
-            for axis in range(3):
-                change = abs(after[axis] - before[axis])
-                largest[axis] = max(largest[axis], change)
-        return largest[0], largest[1], largest[2]
+        rates = self._recent[unit].last(count + self._lag)
+        changes = np.abs(rates[self._lag :] - rates[: -self._lag])
+        x, y, z = changes.max(axis=0, initial=0.0).tolist()
+        return x, y, z
 
     def steady(self, unit: int, other: int, now: int) -> Vector:
         """Return the smallest difference of two IMUs within `QUICK`, by axis, rad/s.
@@ -246,13 +281,12 @@ class RawComparison:
         time now, ns.
         """
         rows = self._rows(unit, other, now)
-        if len(rows) < self.fewest:
+        if rows is None or len(rows) < self.fewest:
             return UNKNOWN_RATES
-        newest, difference = rows[-1]
-        if max(map(abs, difference)) < LARGE_DIFFERENCE:
+        if max(map(abs, rows.values[-1].tolist())) < LARGE_DIFFERENCE:
             return 0.0, 0.0, 0.0
         sign = 1.0 if unit < other else -1.0
-        before = sign * np.array([row for at, row in rows if at > newest - TURNED])
+        before = sign * rows.values[rows.times > rows.times[-1] - TURNED]
         values = before[-self.fewest :]
         least = np.array(list(map(nearest_zero, values.T.tolist())))
         smooth = np.abs(_mean(values)) >= SMOOTHNESS * _roughness(values)
@@ -273,58 +307,63 @@ class RawComparison:
         `fewest`.
         """
         rows = self._rows(unit, other, now)
-        ages = [rows[-1][0] - at for at, _ in rows]
-        count = last or max(self.fewest, sum(age < AVERAGED for age in ages))
-        if len(rows) < max(2, count) or now - rows[-count][0] > CURRENT:
+        if rows is None:
             return None
-        if min(before - after for before, after in pairwise(ages)) > self._longest:
+        times = rows.times
+        ages = times[-1] - times
+        count = last or max(self.fewest, int(np.count_nonzero(ages < AVERAGED)))
+        if len(rows) < max(2, count) or now - times[-count] > CURRENT:
+            return None
+        pauses = times[1:] - times[:-1]
+        if pauses.min() > self._longest:
             return None
         sign = 1.0 if unit < other else -1.0
-        values = sign * np.array([difference for _, difference in rows])
+        values = sign * rows.values
         late = values[-count:]
         mean = _mean(late)
         spread = _spread(late, mean)
         std = spread / math.sqrt(count)
         # A hole may hide half of an oscillation, so the time before it counts as well.
-        ahead = max(before - after for before, after in pairwise(ages[-count:]))
-        span = 2 * AVERAGED if ahead > QUICK else AVERAGED
-        seen = values[-max(count, sum(age < span for age in ages)) :]
+        has_hole = pauses[1 - count :].max() > QUICK
+        span = 2 * AVERAGED if has_hole else AVERAGED
+        seen = values[-max(count, int(np.count_nonzero(ages < span))) :]
         steady = np.abs(_mean(seen)) >= SMOOTHNESS * _roughness(seen)
         if (~steady & (np.abs(mean) >= spread)).any():
-            steady |= _lasts(values, np.array(ages) // AVERAGED)
+            steady |= _lasts(values, ages // AVERAGED)
         if steady.any():
             steady &= ~self._vibrates(unit, other)
         x, y, z = (tuple(row.tolist()) for row in (mean, spread, std))
         return Difference(x, y, z, tuple(steady.tolist()))
 
-    def _rows(self, unit: int, other: int, now: int) -> list[tuple[int, Vector]]:
-        """Return times and differences of late of two IMUs. Empty: none is recent.
+    def _rows(self, unit: int, other: int, now: int) -> Rows | None:
+        """Return times and differences of late of two IMUs, or None if none is recent.
 
         Differences are those of the IMU with the smaller number less the other one.
         """
         rows = self._pairs[min(unit, other), max(unit, other)]
-        return list(rows) if rows and now - rows[-1][0] <= CURRENT else []
+        is_recent = len(rows) and now - rows.times[-1] <= CURRENT
+        return rows if is_recent else None
 
     def _vibrates(self, unit: int, other: int) -> np.ndarray:
         """Return which axes vibrate rather than differ. None do where no message is missing."""
         pair = min(unit, other), max(unit, other)
         rows = self._pairs[pair]
-        ends = rows[0][0], rows[-1][0]
+        ends = int(rows.times[0]), int(rows.times[-1])
         if self._judged[pair] != ends:
             self._judged[pair] = ends
             self._waves[pair] = _is_wave(rows, self._longest)
         return self._waves[pair]
 
 
-def _is_wave(rows: Sequence[tuple[int, Vector]], longest: int) -> np.ndarray:
+def _is_wave(rows: Rows, longest: int) -> np.ndarray:
     """Return which columns an oscillation explains better than a line, beside holes.
 
     A hole is longer than longest, ns.
     """
-    times = np.array([at for at, _ in rows])
-    if len(times) < JUDGED or np.diff(times).max() <= longest:
+    times = rows.times
+    values = rows.values
+    if len(rows) < JUDGED or np.diff(times).max() <= longest:
         return np.zeros(3, dtype=bool)
-    values = np.array([difference for _, difference in rows])
     age = (times[-1] - times) / NS
     phase = 2.0 * np.pi * FREQUENCIES[:, None] * age
     line = _unexplained(np.ones((1, len(age))), age[None], values)
@@ -384,6 +423,18 @@ def _lasts(values: np.ndarray, window: np.ndarray) -> np.ndarray:
     one_sign = np.abs(np.sign(means).sum(axis=0)) == WINDOWS
     lasting: np.ndarray = one_sign & (np.abs(means) >= stds).all(axis=0)
     return lasting
+
+
+def shift(one: Vector, other: Vector) -> Vector:
+    """Return the mean difference of two healthy IMUs that measure `USUAL_SKEW` apart.
+
+    By axis, rad/s: of the rate that both gain, or both lose, within `AVERAGED`. Given: what
+    each gains.
+    """
+    share = USUAL_SKEW / AVERAGED
+    pairs = zip(one, other, strict=True)
+    x, y, z = (share * abs(nearest_zero(pair)) for pair in pairs)
+    return x, y, z
 
 
 def nearest_zero(values: Sequence[float]) -> float:

@@ -12,7 +12,7 @@ import pytest
 from fdi_ros.core.states import ChannelState
 from fdi_ros.mavlink.failover_evidence import STATES_KNOWN_FOR, Evidence
 from fdi_ros.mavlink.failover_policy import Imu
-from fdi_ros.mavlink.failover_raw import RawComparison
+from fdi_ros.mavlink.failover_raw import RawComparison, Rows
 
 MS = 1_000_000
 NS = 1000 * MS
@@ -599,6 +599,16 @@ def test_a_monitor_that_died_names_nobody() -> None:
     assert watched.run(0.8 * STATES_KNOWN_FOR / NS).step()[0].named is True
     found = watched.run(0.3 * STATES_KNOWN_FOR / NS).step()
     assert [(imu.named, imu.ok) for imu in found] == [(None, False)] * 3
+
+
+def test_rows_are_the_last_ones_in_their_order() -> None:
+    rows = Rows(kept=3)
+    for k in range(100):
+        rows.append(k, (k, 0.0, 0.0))
+        assert rows.times.tolist() == list(range(max(0, k - 2), k + 1))
+        assert rows.last(2)[:, 0].tolist() == list(range(max(0, k - 1), k + 1))
+    rows.drop(98)
+    assert rows.values.tolist() == [[99.0, 0.0, 0.0]]
 
 
 @pytest.mark.parametrize(("apart", "compared"), [(7, True), (9, False)])
