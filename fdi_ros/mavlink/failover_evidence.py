@@ -223,7 +223,7 @@ class Evidence:
         self._known_at: dict[tuple[int, int], int] = {}
         self._tracks = [Track() for _ in range(count)]
         self._min_size = min_size
-        self._sized = SIZED // interval
+        self._sized = max(2, SIZED // interval)
         self._together: int | None = None  # since when all IMUs agree, ns
         self._odd = -1  # the IMU that is bad without a name, or -1
         self._odd_since = 0

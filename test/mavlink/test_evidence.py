@@ -611,6 +611,16 @@ def test_rows_are_the_last_ones_in_their_order() -> None:
     assert rows.values.tolist() == [[99.0, 0.0, 0.0]]
 
 
+def test_an_error_has_a_size_on_a_slow_link_too() -> None:
+    """At 22 Hz two samples are all within the time over which it is averaged."""
+    watched = Watched(interval=45 * MS)
+    watched.gyros[1] = biased(0.5)
+    watched.run(1.0)
+    axis, size = watched.evidence.error(1, watched.now) or ("", 0.0)
+    assert axis == "x"
+    assert size == pytest.approx(0.5, abs=0.02)
+
+
 @pytest.mark.parametrize(("apart", "compared"), [(7, True), (9, False)])
 def test_samples_form_a_pair_within_four_tenths_of_an_interval(
     apart: int, compared: bool
