@@ -343,7 +343,8 @@ class Failover:
         ]
         imus: list[Imu] = []
         lanes = 255 if self._lanes is None else self._lanes
-        for k, imu in enumerate(evidence.look(delivers, self.out, now)):
+        taken = [k for k, one in enumerate(self._state.memories) if one.taken]
+        for k, imu in enumerate(evidence.look(delivers, self.out, now, taken)):
             use, heard = self._values[k]
             # Those of another system do not count for the one with an IMU out.
             if not self._is_same or now - heard >= USE_KNOWN_FOR:

@@ -8,7 +8,8 @@ comparison does neither and shows the present difference of the autopilot's own 
 
 Two of three IMUs can be wrong alike: both stand still, or both are remembered as faulty. So
 they outvote the third only if they are trusted (`TRUSTED`), if their values change, and if
-the monitor has no doubt about them that it does not have about the third as well.
+the monitor has no doubt about them that it does not have about the third as well. Two that
+were both taken out in this flight never outvote one that was not.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ CALM = 0.1
 #: dead gyro agrees with one at rest.
 TURN_RATE = 0.1
 #: One that was bad agrees only after a turn in which its error, if in proportion to the
-#: rate, would be this multiple of ``min_size``.
+#: rate, would be this multiple of ``min_size``, and at least one in which this was so of a
+#: dead gyro.
 SHOWN = 2.0
 #: Or a turn at this part of the rate at which it was seen to be bad. At 0.4 gyros that have
 #: lost a part of their scale agree for 13 % of the time, now for 5 %. At 1.0 half of the
@@ -90,6 +92,7 @@ class Compared(NamedTuple):
     apart: Vector
     bound: Vector  #: A bound that two that agree keep: mean, or scatter from `CALM` on.
     mean: Vector  #: Steady or not.
+    full: Vector  #: The same, with what scales explain.
 
 
 class Wrong(NamedTuple):
@@ -101,7 +104,7 @@ class Wrong(NamedTuple):
     share: float  #: Largest ratio of error and rate: 1 for a gyro without scale.
 
 
-UNCOMPARED = Compared(UNKNOWN_RATES, UNKNOWN_RATES, UNKNOWN_RATES)
+UNCOMPARED = Compared(*[UNKNOWN_RATES] * 4)
 
 
 @dataclass
@@ -191,11 +194,13 @@ def _compared(
     axes = []
     for axis, mean in enumerate(difference.mean):
         spread = difference.spread[axis]
-        size = max(0.0, abs(mean) - scale - shifts[axis])
+        full = max(0.0, abs(mean) - shifts[axis])
+        size = max(0.0, full - scale)
         is_wild = math.hypot(mean, spread) >= WILD_OSCILLATION + scale
         is_steady = difference.steady[axis] or abs(quick[axis]) >= LARGE_DIFFERENCE
         apart = size if is_steady else WILD_OSCILLATION if is_wild else 0.0
-        axes.append((apart, max(size, spread if spread >= CALM else 0.0), size))
+        bound = max(size, spread if spread >= CALM else 0.0)
+        axes.append((apart, bound, size, full))
     return Compared(*zip(*axes, strict=True))
 
 
@@ -222,6 +227,7 @@ class Evidence:
         self._pairs: dict[tuple[int, int], Compared] = {}
         self._known_at: dict[tuple[int, int], int] = {}
         self._tracks = [Track() for _ in range(count)]
+        self._once_bad: set[int] = set()  # IMUs taken out in this flight
         self._min_size = min_size
         self._sized = max(2, SIZED // interval)
         self._together: int | None = None  # since when all IMUs agree, ns
@@ -240,7 +246,11 @@ class Evidence:
             track.states = tuple(found[3 * k : 3 * k + 3])
 
     def look(
-        self, delivers: Sequence[bool], out: Sequence[int], now: int
+        self,
+        delivers: Sequence[bool],
+        out: Sequence[int],
+        now: int,
+        taken: Sequence[int] = (),
     ) -> tuple[Imu, ...]:
         """Return the IMUs at time now, ns.
 
@@ -251,12 +261,15 @@ class Evidence:
         out
             IMUs, from 0, out of use by our orders. Two bad IMUs may agree with each
             other, so agreement with these counts only while they are trusted.
+        taken
+            IMUs that our orders took out of use in this flight, back in use or not.
         """
         if now - self.heard >= STATES_KNOWN_FOR:
             for track in self._tracks:
                 track.states = ()
         units = [k for k, does in enumerate(delivers) if does]
         self.raw.leave_out(out)
+        self._once_bad = {*out, *taken}
         self._compare(units, now)
         self._note_trust(units, now)
         odd, accused = self._lasting_odd_one(units, now)
@@ -366,7 +379,14 @@ class Evidence:
         """Return since when an IMU agrees with another, ns, or None."""
         track = self._tracks[unit]
         doubted = bool(track.doubts)
-        agreeing = [k for k in partners if self._agree(unit, k, doubted)]
+        # In a fast turn, what scales explain would hide the error of an IMU that was bad.
+        was_bad = is_out or track.wrong is not None
+        fit = [
+            k
+            for k in partners
+            if not was_bad or max(self._pairs[unit, k].full) < self._min_size
+        ]
+        agreeing = [k for k in fit if self._agree(unit, k, doubted)]
         is_contradicted = is_out and self._is_contradicted(unit, partners)
         if agreeing:
             track.agreed_at = now
@@ -391,6 +411,8 @@ class Evidence:
         size, axis = max((size, axis) for axis, size in enumerate(track.nearest))
         if not size >= self._min_size:
             return
+        # A turn from before the error shows nothing.
+        track.turned = None
         # Of a gyro without scale the error is this rate at most.
         rate = max(self.raw.peaks(k)[axis] for k in partners)
         share = size / max(rate, TINY)
@@ -407,16 +429,16 @@ class Evidence:
         """Return whether a turn of another IMU shows the error of one that agrees with it.
 
         A bias was apart at rest too. A gyro that has lost its scale on one axis shows that
-        only in turns about this axis.
+        only in turns about this axis, and after any error a gyro may be dead.
         """
         turn = self.raw.turn(other)
         if wrong is None:
             return math.hypot(*turn) >= TURN_RATE
         # What scatters does not agree from `CALM` on: twice that is shown by a shake.
         shake = self.raw.shake(other)[wrong.axis] / (2.0 * CALM)
-        shown = max(abs(turn[wrong.axis]), SHOWN * self._min_size * shake)
-        needed = SHOWN * self._min_size / wrong.share
-        return shown >= min(SAME_TURN * wrong.rate, needed)
+        dead = SHOWN * self._min_size
+        shown = max(abs(turn[wrong.axis]), dead * shake)
+        return shown >= max(dead, min(SAME_TURN * wrong.rate, dead / wrong.share))
 
     def _partners(
         self, unit: int, units: Sequence[int], out: Sequence[int]
@@ -455,14 +477,23 @@ class Evidence:
             for k in partners
         )
 
+    def _voters(self, unit: int, units: Sequence[int]) -> list[int]:
+        """Return the two other IMUs, if they may outvote one, or none.
+
+        Two that were bad in this flight may be bad alike again.
+        """
+        others = [k for k in units if k != unit]
+        may = unit in self._once_bad or not self._once_bad.issuperset(others)
+        return others if len(others) == 2 and unit in units and may else []
+
     def _is_odd(self, unit: int, units: Sequence[int]) -> bool:
         """Return whether the two other IMUs agree, and nothing is against these two.
 
         They are trusted, their values change, and every doubt that the monitor has of
         them was refuted before, or is one that it has of this IMU too.
         """
-        others = [k for k in units if k != unit]
-        if len(others) != 2 or unit not in units:
+        others = self._voters(unit, units)
+        if not others:
             return False
         size = min(max(self._pairs[unit, k].apart) for k in others)
         between = max(self._pairs[others[0], others[1]].mean)
@@ -481,8 +512,8 @@ class Evidence:
 
         One of these two may be bad on another axis: then no two IMUs agree on all axes.
         """
-        others = [k for k in units if k != unit]
-        if len(others) != 2 or unit not in units:
+        others = self._voters(unit, units)
+        if not others:
             return set()
         between = self._pairs[others[0], others[1]].mean
         doubted = {axis for k in others for axis in self._tracks[k].axes(*DOUBTS)}
@@ -527,9 +558,9 @@ class Evidence:
         found = [(k, axes, SET_STANDS) for k, axes in sets.items() if axes]
         if len(found) != 1:
             return NOBODY
-        others = [k for k in units if k != found[0][0]]
-        trusted = all(map(self._is_trusted, others))
-        return found[0] if trusted or len(others) < 2 else NOBODY
+        voters = self._voters(found[0][0], units)
+        trusted = voters and all(map(self._is_trusted, voters))
+        return found[0] if trusted or len(units) < 3 else NOBODY
 
     def _clear_axes(self, unit: int, units: Sequence[int], now: int) -> set[int]:
         """Return the axes on which an IMU is far off from both others, in one direction.

@@ -29,9 +29,9 @@ Definitions
 
 Rules, in this order at each tick
     1. A held IMU goes back in use if the operator asks; if every other IMU is dead or out
-       of use; or if the IMU has not been apart for a pause, counted from a turn that would
-       show its error: at rest a gyro that has lost its scale agrees too. The pause is
-       `FIRST_PAUSE`, doubled each time the IMU is taken out in one flight. In flight the
+       of use; or if the IMU has not been apart for a pause, counted from our order and from
+       a turn that would show its error: at rest a gyro that has lost its scale agrees too.
+       The pause is `FIRST_PAUSE`, doubled each time the IMU is taken out in one flight. In flight the
        last case needs a live monitor, and if all that are in use are bad, an IMU goes back
        at once that the monitor finds OK, or soon if it is off by a `LESSER`-th. On the
        ground the IMU stays out until the monitor finds it OK. An IMU that was out when the
@@ -355,7 +355,8 @@ def _release(
     lesser = min(in_use, default=0.0) / LESSER
     for memory, imu in pairs:
         pause = min(FIRST_PAUSE << max(0, memory.taken - 1), LONGEST_PAUSE)
-        agrees = has_stood(imu.agreed, pause, now)
+        is_paused = now - memory.out_sent < pause
+        agrees = has_stood(imu.agreed, pause, now) and not is_paused
         may = view.monitored if view.armed else imu.ok
         heals = agrees and may and is_alive(imu)
         is_lesser = only_bad and imu.least < lesser

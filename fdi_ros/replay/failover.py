@@ -119,7 +119,8 @@ class FailoverReplay(Sink):
         memories = self._state.memories
         out = [k for k, memory in enumerate(memories) if memory.ours]
         delivers = [now - last < SILENCE for last in self._delivered]
-        imus = self._evidence.look(delivers, out, now)
+        taken = [k for k, memory in enumerate(memories) if memory.taken]
+        imus = self._evidence.look(delivers, out, now, taken)
         imus = tuple(
             imu._replace(use=use, heard=now)
             for imu, use in zip(imus, self._use, strict=True)

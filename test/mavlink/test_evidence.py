@@ -51,6 +51,7 @@ class Watched:
         self.gyros: list[Gyro] = [sound] * count
         self.states = [OK] * 3 * count
         self.out: list[int] = []
+        self.taken: list[int] = []
         self.is_reporting = True
         self.now = START
         self.random = np.random.default_rng(1)
@@ -80,7 +81,7 @@ class Watched:
         if self.now - self.looked < 3 * STEP // 4:
             return self.evidence.imus
         self.looked = self.now
-        return self.evidence.look(delivers, self.out, self.now)
+        return self.evidence.look(delivers, self.out, self.now, self.taken)
 
     def blamed(self, seconds: float) -> set[int]:
         """Return the IMUs, from 0, that are blamed at some time of the next seconds."""
@@ -169,6 +170,22 @@ def test_two_that_were_wrong_before_are_not_trusted_once_they_agree() -> None:
         watched.run(5.0 * (1 - k))
     watched.states = [OK] * 9
     assert 2 not in watched.blamed(8.0)
+
+
+@pytest.mark.parametrize("state", [OK, AMBIGUOUS])
+@pytest.mark.parametrize(
+    ("taken", "blamed"), [([0], {2}), ([0, 1], set()), ([0, 1, 2], {2})]
+)
+def test_two_that_were_bad_in_this_flight_do_not_outvote_one_that_was_not(
+    taken: list[int], blamed: set[int], state: int
+) -> None:
+    watched = Watched()
+    watched.taken = taken
+    watched.gyros[2] = biased(0.7)
+    watched.states[6] = state
+    assert watched.blamed(3.0) == blamed
+    watched.states[6] = FAULTY
+    assert watched.blamed(1.0) == {2}
 
 
 def test_held_imus_that_both_read_zero_do_not_agree() -> None:

@@ -810,12 +810,43 @@ def test_a_lost_part_of_the_scale_stays_out_in_slow_turns(tmp_path: Path) -> Non
     assert talk.heal(1, 8.0).in_use == [False, True, True]
 
 
-def test_a_short_error_in_a_hover_goes_back_there(tmp_path: Path) -> None:
-    """It was no share of rates this small, so a turn would show no more."""
-    talk, _ = moving(tmp_path, 0.05, 0.03, 0.02)
-    talk.fault(2, 1.0, seconds=1.0)
-    assert talk.in_use == [True, False, True]
-    assert talk.heal(2, 4.0).in_use == [True] * 3
+@pytest.mark.parametrize("duration", [0.08, 1.0])
+@pytest.mark.parametrize("is_dead", [True, False])
+def test_a_short_error_in_a_hover_goes_back_after_a_turn(
+    tmp_path: Path, duration: float, is_dead: bool
+) -> None:
+    """Since then the gyro may be dead, which a hover does not show."""
+    talk, moved = moving(tmp_path, 0.2, 0.2, 0.02)
+    moved.rate = np.array([0.01, 0.02, 0.01])
+    talk.fault(2, 1.0, (OK, OK, OK), seconds=duration)
+    moved.scale[1] = 0.0 if is_dead else 1.0
+    assert talk.heal(2, 8.0).in_use == [True, False, True]
+    moved.rate = np.array([0.01, 0.2, 0.01])
+    assert talk.run(4.0).in_use == [True, not is_dead, True]
+    assert talk.in_use[2]
+
+
+@pytest.mark.parametrize("is_dead", [True, False])
+def test_a_fast_turn_about_another_axis_hides_no_error(
+    tmp_path: Path, is_dead: bool
+) -> None:
+    """5 % of a yaw of 2 rad/s is more than the error of each IMU on another axis."""
+    talk, moved = moving(tmp_path, 0.4, 0.3, 0.1)
+    for imu, size in ((1, 0.12), (2, -0.1)):
+        if is_dead:
+            moved.scale[imu - 1, 0] = 0.0
+            talk.fault(imu, 0.0, (FAULTY, OK, OK), seconds=1.0)
+        else:
+            talk.fault(imu, size, seconds=1.0)
+    assert talk.in_use == [False, False, True]
+    moved.rate = np.array([0.05, 0.05, 2.0])
+    assert talk.run(6.0).in_use == [False, False, True]
+    moved.rate = np.array([1.0, 0.05, 0.1])
+    assert talk.run(3.0).in_use == [False, False, True]
+    moved.rate = np.array([0.3, 0.3, 2.0])
+    moved.scale[:] = 1.0
+    talk.heal(1)
+    assert talk.heal(2, 6.0).in_use == [True] * 3
 
 
 @pytest.mark.parametrize("bad", [(2,), (2, 3)])

@@ -44,6 +44,13 @@ def test_the_pause_before_an_imu_goes_back_doubles_each_time_it_was_taken_out(ta
     assert not tick(memory, agreed + pause, use=False, agreed=agreed).held
 
 
+def test_the_pause_counts_from_our_order_where_the_agreement_is_older():
+    """An error of less than 100 ms ends no agreement."""
+    agreed = START - 10 * FIRST_PAUSE
+    assert tick(OUT, START + FIRST_PAUSE - MS, use=False, agreed=agreed).held
+    assert not tick(OUT, START + FIRST_PAUSE, use=False, agreed=agreed).held
+
+
 def reported(memory, first, last):
     """Memory after reports of an IMU in use, every 20 ms from one time to another."""
     for now in range(first, last, 20 * MS):
