@@ -21,6 +21,7 @@ from fdi_ros.mavlink.failover_policy import (
     PolicyState,
     View,
     decide,
+    is_refused,
 )
 from fdi_ros.mavlink.failover_probe import Probe, probe
 from fdi_ros.mavlink.failover_raw import CURRENT
@@ -430,9 +431,10 @@ class Failover:
     def _judge_readiness(self, view: View, now: int) -> Words | None:
         """Return that failover is ready, or not any more and why, once that lasts."""
         facts = self._facts(view, now)
-        is_out = bool(self.out)
+        memories = self._state.memories
+        is_out = any(memory.ours and not is_refused(memory) for memory in memories)
         reason = not_again if is_out else not_ready
-        why = reason(self._state.memories, view, facts, now, self._settings)
+        why = reason(memories, view, facts, now, self._settings)
         may_warn = view.armed and self._vehicle.in_reach
         self._readiness, words = self._readiness.hear(why, is_out, may_warn, now)
         return words

@@ -205,6 +205,11 @@ def is_sound(imu: Imu, settings: PolicySettings) -> bool:
     return is_alive(imu) and (imu.ok or imu.size < settings.min_size)
 
 
+def is_refused(memory: Memory) -> bool:
+    """Return whether an IMU is reported in use after many orders to take it out."""
+    return memory.held and memory.seen is True and memory.tries > QUICK_TRIES
+
+
 def has_stood(since: int | None, duration: int, now: int) -> bool:
     """Return whether a condition that began at since, ns, has lasted for a duration, ns."""
     return since is not None and now - since >= duration

@@ -100,7 +100,12 @@ def not_again(
 ) -> str:
     """Return why, beside an IMU that is out, no other one could go out. Empty: no reason."""
     view = _without_late_answers(memories, view, now)
-    none_can = all(_objections(memories, view, now, settings))
+    against = _objections(memories, view, now, settings)
+    none_can = all(
+        words
+        for memory, words in zip(memories, against, strict=True)
+        if not memory.ours
+    )
     return doubt(view, facts) or (NO_OTHER if none_can else "")
 
 

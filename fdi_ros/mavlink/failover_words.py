@@ -74,12 +74,14 @@ class Condition(Enum):
     STUCK_OUT = Words(WARNING, "not back in use, though asked")
     REBOOT = Words(CRITICAL, "no notch: set INS_USE{} 1 and reboot")
     STAYS_OUT = Words(CRITICAL, "still faulty, stays out of use")
+    FROZEN = Words(WARNING, "repeats one value, stays out")
     NOT_OK = Words(WARNING, "stays out, monitor does not find it OK")
     UNTURNED = Words(WARNING, "stays out until turned by hand")
     OUT = Words(CRITICAL, "out of use", urgent=True)
     LEFT_ALONE = Words(WARNING, "left alone in this flight")
     UNUSED = Words(WARNING, "not in use, not by failover")
     APART = Words(WARNING, "differs from the others")
+    NO_NOTCH = Words(CRITICAL, "no notch: reboot")
     FINE = Words(INFO, "in use, does not differ")
     # Of the vehicle.
     ALONE = Words(
@@ -172,6 +174,8 @@ def imu_condition(
     is_odd = has_stood(notes[k].apart_since, UNNAMED, now) and is_odd_known(
         view, settings
     )
+    # Not so where it agrees with one that is out of use: then that one has healed.
+    is_alone = imu.least >= settings.min_size
     is_near = imu.size < settings.min_size
     checks = (
         (has_stood(notes[k].bad_since, REACTION, now), Condition.DANGER),
@@ -180,6 +184,7 @@ def imu_condition(
         (is_out and not memory.held, None),
         (stays and memory.without_notch, Condition.REBOOT),
         (stays and imu.named is True, Condition.STAYS_OUT),
+        (stays and imu.stuck, Condition.FROZEN),
         (stays and not imu.ok, Condition.NOT_OK),
         (stays and imu.agreed is None, Condition.UNTURNED),
         # It agrees, and goes back after its pause.
@@ -188,7 +193,8 @@ def imu_condition(
         (view.armed and memory.left_alone, Condition.LEFT_ALONE),
         (memory.seen is False, Condition.UNUSED),
         # Where it agrees again, the one that it differed from was bad.
-        (is_odd and imu.agreed is None, Condition.APART),
+        (is_odd and imu.agreed is None and is_alone, Condition.APART),
+        (_is_in_use(memory) and memory.without_notch, Condition.NO_NOTCH),
         (_is_in_use(memory) and is_near, Condition.FINE),
     )
     return next((condition for holds, condition in checks if holds), None)

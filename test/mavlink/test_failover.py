@@ -1065,7 +1065,7 @@ def test_a_boot_without_notch_filters_is_not_hidden(
     assert "IMU 1 no notch: set INS_USE 1 and reboot" in again.texts
     assert "reboot before flight" in again.failover.status(again.now)[1]
     autopilot.parameters["INS_USE"] = 1.0
-    again.run(5.0)
+    assert again.run(5.0).texts[-1] == "IMU 1 no notch: reboot"
     autopilot.reboot(again.now)
     assert again.run(12.0).failover.status(again.now)[1] == "ready"
 
@@ -1322,6 +1322,21 @@ def test_a_late_monitor_is_announced_while_an_imu_is_out(flying: Monitored) -> N
     assert flying.texts[-1] == "no failover: the monitor is late"
     flying.failover.age = 0.02
     assert flying.run(5.0).texts[-1] == "failover acts again"
+
+
+@pytest.mark.parametrize("limit", [0, 1])
+def test_failover_does_not_act_again_while_an_order_is_refused(
+    tmp_path: Path, limit: int
+) -> None:
+    autopilot = Autopilot("ardupilot")
+    autopilot.read_only.add("INS_USE2")
+    talk = Monitored(tmp_path, autopilot, limit=limit).run(10.0)
+    autopilot.armed = True
+    talk.run(5.0)
+    assert talk.texts[-1] == "no failover: the autopilot refuses INS_USE2"
+    talk.fault(2, 0.3, seconds=8.0)
+    assert talk.in_use == [True] * 3
+    assert "failover acts again" not in talk.texts
 
 
 def test_failover_does_not_act_again_while_no_other_imu_can_go_out(

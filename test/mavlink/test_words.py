@@ -38,7 +38,7 @@ SETTINGS = PolicySettings()
 GOOD = Imu(use=True, heard=NOW, named=False, ok=True, delivers=True, size=0.0, agreed=1)
 BAD = GOOD._replace(named=True, blamed=True, ok=False, size=0.5, agreed=None)
 DOUBTED = GOOD._replace(ok=False)
-APART = DOUBTED._replace(size=0.1, agreed=None)
+APART = DOUBTED._replace(size=0.1, least=0.1, agreed=None)
 OUT = Memory(ours=True, held=True, seen=False, out_sent=LONG_AGO + 1, tries=1, taken=1)
 USED = Memory(seen=True)
 DISPUTED = Memory(seen=True, against_since=NOW)
@@ -66,16 +66,20 @@ def view(*imus: Imu, armed: bool = True, **given) -> View:
         ),
         (Condition.REBOOT, replace(OUT, without_notch=True), BAD, Note(), False),
         (Condition.STAYS_OUT, OUT, BAD, Note(), False),
+        (Condition.FROZEN, OUT, DOUBTED._replace(stuck=True), Note(), False),
         (Condition.NOT_OK, OUT, DOUBTED, Note(), False),
         (Condition.UNTURNED, OUT, GOOD._replace(agreed=None), Note(), False),
         (Condition.OUT, OUT, BAD, Note(), True),
         (Condition.LEFT_ALONE, Memory(seen=False, left_alone=True), BAD, Note(), True),
         (Condition.UNUSED, Memory(seen=False), BAD, Note(), True),
         (Condition.APART, USED, APART, Note(apart_since=0), True),
+        (Condition.NO_NOTCH, replace(USED, without_notch=True), GOOD, Note(), True),
         (Condition.FINE, USED, GOOD, Note(), True),
         # About to go back.
         (None, OUT, GOOD, Note(), False),
         (None, replace(OUT, held=False), GOOD._replace(agreed=None), Note(), True),
+        # Off from those in use, but not from one that is out and has healed.
+        (None, USED, APART._replace(least=0.0), Note(apart_since=0), True),
         # Off, but not for long; of unknown size; not reported in use.
         (None, USED, APART, Note(apart_since=NOW - NS), True),
         # In use, but the newest report says that it is not, or an order is under way.
