@@ -195,6 +195,9 @@ one counts: 50 values distinguish 15 % from 25 %."""
 DOUBTED_SHARE = 0.15
 #: Share from which on a channel is faulty: 2.5 standard deviations above `DOUBTED_SHARE`.
 INTERMITTENT_SHARE = 0.25
+#: Losses in a row that count in the share. A longer run is silence: beside scattered losses
+#: of 20 % it would bring the share of a healthy channel beyond `INTERMITTENT_SHARE`.
+LONGEST_COUNTED = 10
 #: A non-finite value and the next two values are left out of the rate.
 RETURNING = 3
 #: Least number of recent losses of an intermittent channel. Single holes do not count.
@@ -207,10 +210,17 @@ def follow_share(health: Health, i: int, finite: bool, step: int) -> None:
 
     ``step`` is the time since the previous value, ns.
     """
+    health.returning[i] = max(health.returning[i] - 1, 0) if finite else RETURNING
+    gone_for = health.received_stamp[i] - health.bad_stamp[i]
+    if (
+        not finite
+        and health.bad_stamp[i] != NOT_BAD
+        and gone_for >= LONGEST_COUNTED * step
+    ):
+        return
     adaptation_gain = min(step / SHARE_TIME, 1.0 / SHARE_SAMPLES)
     health.gone[i] += adaptation_gain * ((0.0 if finite else 1.0) - health.gone[i])
     health.leaves[i] *= 1.0 - adaptation_gain
-    health.returning[i] = max(health.returning[i] - 1, 0) if finite else RETURNING
     if not finite and health.bad_stamp[i] == NOT_BAD:
         health.leaves[i] += 1.0
 

@@ -547,3 +547,19 @@ def test_values_that_the_bus_loses_in_all_units_make_no_gyro_faulty(
     ].all()
     # Where enough is delivered, the others still check a channel.
     assert (output.state[:2000, :6] == ChannelState.OK).mean() > 0.3
+
+
+@pytest.mark.parametrize("share", [0.0, 0.08, 0.2])
+@pytest.mark.parametrize("settings", [TWO, THREE])
+def test_a_unit_that_is_silent_for_a_while_is_not_one_whose_values_come_and_go(
+    settings, share
+):
+    pipeline = Pipeline(settings)
+    block = stream(pipeline.geometry, 2500)
+    lost = np.random.default_rng(5).random((2500, pipeline.geometry.n // 3)) < share
+    lost[1000:1300, 1] = True
+    block.z[lost.repeat(3, axis=1)] = np.nan
+    output = pipeline.process(block)
+    assert declarations(pipeline, output) == []
+    assert (output.state[1050:1300, 3:6] == ChannelState.STALE).all()
+    assert (output.state[2000:, 3:6] == ChannelState.OK).mean() > 0.3
