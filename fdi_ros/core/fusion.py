@@ -67,7 +67,11 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         covariance_of(
             now.gain, n, now.variance, core.sample.estimate.covariance, last.covariance
         )
-        add_alternatives(core, now, last, subsets, doubtful & now.usable)
+        contradicted = find_contradicted(core, now, last)
+        update_leapt(core, now, last, subsets, contradicted)
+        wrong = contradicted | doubtful & now.usable
+        add_alternatives(core, now, last, subsets, wrong)
+        add_unchecked(core, now, last, subsets, wrong)
         add_jumps(core, now, last, subsets)
         if doubtful & now.usable:
             add_units(settings, now, last, subsets, doubtful & now.usable)
@@ -187,6 +191,16 @@ def is_contradicted(
 
 
 @compiled
+def find_contradicted(core: Core, now: Current, last: OutputRow) -> int:
+    """Return the usable channels that contradict the rate."""
+    contradicted = 0
+    for i in range(core.settings.n):
+        if now.usable >> i & 1 and is_contradicted(core.settings, now, last, i):
+            contradicted |= 1 << i
+    return contradicted
+
+
+@compiled
 def update_course(core: Core) -> None:
     """Extrapolate the last two values of each channel to this sample."""
     now = core.now
@@ -226,9 +240,9 @@ def add_alternatives(
     now: Current,
     last: OutputRow,
     subsets: NDArray[Any],
-    doubtful: int,
+    candidates: int,
 ) -> None:
-    """Widen the covariance where usable channels contradict the rate or are in doubt.
+    """Widen the covariance for usable channels that contradict the rate or are in doubt.
 
     Such a channel may be wrong if it is fused. If it is left out, it may be right unless
     it jumped away, and then a channel is wrong that no other fused channel replaces.
@@ -236,12 +250,6 @@ def add_alternatives(
     of a mean of two channels, one of which is wrong, is then one standard deviation.
     """
     n = core.settings.n
-    contradicted = 0
-    for i in range(n):
-        if now.usable >> i & 1 and is_contradicted(core.settings, now, last, i):
-            contradicted |= 1 << i
-    update_leapt(core, now, last, subsets, contradicted)
-    candidates = contradicted | doubtful
     wrong = candidates & now.fused
     right = candidates & ~now.fused & ~core.leapt
     if wrong | right == 0:
@@ -273,6 +281,32 @@ def add_alternative(
         difference = now.doubt[a] - last.rate[a]
         now.doubt[a] = max(min(difference, LARGEST_DIFFERENCE), -LARGEST_DIFFERENCE)
     add_square(last.covariance, now.doubt, 0.5)
+
+
+@compiled
+def add_unchecked(
+    core: Core, now: Current, last: OutputRow, subsets: NDArray[Any], candidates: int
+) -> None:
+    """Widen the covariance for a channel that was wrong or in doubt, and that nothing checks now.
+
+    Its largest deviation since it is a candidate is kept while others check it. Without
+    them its error counts as that large, or as large as its value: the error of a wrong
+    gain or sign grows with the rate.
+    """
+    for i in range(core.settings.n):
+        if not now.usable >> i & 1:
+            continue
+        rest = now.fused & ~(1 << i)
+        if subsets[rest].spans:
+            fill_rate(subsets[rest], core.settings.n, rest, now.corrected, now.doubt)
+            others = along(core.settings.sensors.axes[i], now.doubt)
+            deviation = abs(now.corrected[i] - others)
+            kept = max(core.deviation[i], deviation)
+            core.deviation[i] = kept if candidates >> i & 1 else 0.0
+        elif now.fused >> i & 1 and core.deviation[i] > 0.0:
+            error = max(core.deviation[i], abs(now.corrected[i]))
+            error = min(error, LARGEST_DIFFERENCE)
+            add_square(last.covariance, now.gain[:, i], error * error)
 
 
 @compiled

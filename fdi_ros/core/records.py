@@ -694,6 +694,9 @@ class Core:
     before: Channels  # corrected values of the last sample, rad/s
     earlier: Channels  # and of the one before it
     leapt: Mask  # left out of the rate since a jump away from it
+    # largest deviation from the others of a channel since it contradicts them or is in
+    # doubt, rad/s
+    deviation: Channels
     saturated: Flag  # a manoeuvre has driven a channel out of range
     saturated_stamp: Whole  # last sample with a saturated channel, ns
     samples: Whole  # so far
