@@ -300,7 +300,8 @@ def update_coherence(params: Constants, kf: Estimator) -> float:
                 along += shared.alone.gain[a, i] * part
         total += shared.apart[i]
         shared.apart_sum[i] = 0.0
-        if steady and shared.alone.information[i, i] > 0.0:
+        # One correlation corrects once: values missing leave blocks without a new one.
+        if steady and shared.taken and shared.alone.information[i, i] > 0.0:
             noise.cross[i] = min(
                 max(2.0 * along / shared.alone.information[i, i], -THREE_SIGMA),
                 THREE_SIGMA,

@@ -376,6 +376,29 @@ def test_shared_noise_stays_a_covariance_while_channels_are_missing():
         assert spectrum.min() > -1e-9 * spectrum.max(), name
 
 
+@pytest.mark.parametrize("together", [1, 3])
+def test_the_covariance_is_true_while_values_are_missing(together):
+    """Two units lose 10 % of the values, by chance: of single channels, or of whole units."""
+    seconds = np.arange(0.0, 40.0, 1.0 / RATE)
+    motion = swing(seconds, 0.3) * np.clip(seconds - 3.0, 0.0, 1.0)[:, None]
+    pipeline = Pipeline.from_config(parallel(2, detector__name="sequential"))
+    for seed in range(4):
+        rng = np.random.default_rng([seed, 12])
+        z = np.tile(motion, 2) + 0.002 * rng.standard_normal(6)
+        z += SIGMA * white(seed, len(seconds))
+        lost = rng.random((len(seconds), 6 // together)) < 0.1
+        z[np.repeat(lost, together, axis=1)] = np.nan
+        pipeline.restart()
+        output = pipeline.process(stamped(seconds, z))
+        rows = output.valid & (seconds > 5.0)
+        error = (output.rate - motion)[rows]
+        weighed = np.linalg.solve(output.covariance[rows], error[..., None])[..., 0]
+        chi = np.einsum("ki,ki->k", error, weighed)
+        assert 0.5 < chi.mean() / 3.0 < 1.1
+        # Chi-square with 3 degrees of freedom reaches this in one of 5e7 samples.
+        assert chi.max() < 37.0
+
+
 @pytest.mark.parametrize("hertz", [6.3, 9.7])
 def test_a_slow_motion_under_loud_noise_is_no_rest(hertz):
     """A unit that oscillates by 0.4 rad/s hides how the body turns; no bias is learned of it."""
