@@ -131,7 +131,8 @@ def update_drifted(settings: PathSettings, sample: SampleInput, now: Current) ->
     if settings.max_drift > 0.0 and estimate.is_current:
         for i in range(settings.n):
             bias = abs(estimate.bias[i]) - SURE_DRIFT * estimate.bias_std[i]
-            if sample.mask >> i & 1 and bias > settings.max_drift:
+            clear = sample.mask & ~estimate.unclear
+            if clear >> i & 1 and bias > settings.max_drift:
                 now.evidence.drifted |= 1 << i
                 now.verdict.suspects[i] = True
                 now.verdict.error[i] = estimate.bias[i]

@@ -187,6 +187,9 @@ class Estimate:
     excess: Real
     bias: Channels  # in addition to the bias from the start, rad/s
     bias_std: Channels  # standard deviation of `bias`, rad/s
+    # channels whose `bias` may be errors of others: a fault of each alone did not explain
+    # the values
+    unclear: Mask
     late: Units  # certain delay of the stamps of each unit, s, which `restamp` corrects
     behind: Real  # time from measurement to stamp, if the earliest unit is not late, s
     largest_delay: Real  # largest delay between units, s

@@ -23,15 +23,18 @@ from fdi_ros.compiling.compiled import (
     Flag,
     Mask,
     Real,
+    Square,
     Whole,
     compiled,
     record,
 )
 from fdi_ros.core.algebra import dot, invert
+from fdi_ros.core.subsets import number_in
 from fdi_ros.detectors.naming import (
     FEW_CHECKS,
     Inference,
     explain_with_misfit,
+    leaves_noise,
     redundancy,
     set_mean,
     unexplained,
@@ -158,6 +161,9 @@ class Case:
     healthy_move: Real  # standard deviation of the move of each healthy bias since the onset, rad/s
     sudden: Mask  # channels that the change at the onset names
     unsolved: Real  # time without an explaining hypothesis, less the time with one, s
+    # time in which faults of channels i and j, or of i alone, left more than noise, less
+    # the time in which they did not, s
+    unfit: Square
     retry: Whole  # earliest sample at which a case may open again
     before: ErrorStates  # states when the case opened
     moved: Real  # recent move of all biases, rad/s
@@ -470,8 +476,10 @@ def name_channels(params: Constants, state: State) -> None:
         find_sudden(params, kf, case)
     if explain_beside_moves(params, state, size):
         return
-    case.next = kf.samples + max(size // RENAME, 1)
-    if gives_up(params, state, max(size // RENAME, 1) * params.period):
+    steps = max(size // RENAME, 1)
+    case.next = kf.samples + steps
+    follow_fits(params, case, steps * params.period)
+    if gives_up(params, state, steps * params.period):
         return
     if inference.common and shows_others(params, state, inference.common):
         widen(params, state)
@@ -658,6 +666,60 @@ def explain_case(
 
 
 @compiled
+def follow_fits(params: Constants, case: Case, seconds: float) -> None:
+    """Follow for how long each fault of one channel or two has not explained the mean."""
+    inference = case.inference
+    n = params.sensors.n
+    for k in range(inference.small):
+        first, last = ends_of(inference.members[k], n)
+        passed = -seconds if leaves_noise(inference, n, k) else seconds
+        unfit = case.unfit[first, last] + passed
+        case.unfit[first, last] = min(max(unfit, 0.0), UNSOLVED)
+
+
+@compiled
+def ends_of(mask: int, n: int) -> tuple[int, int]:
+    """Return the first and the last channel of a set, of n."""
+    first = last = -1
+    for i in range(n):
+        if mask >> i & 1:
+            last = i
+            if first < 0:
+                first = i
+    return first, last
+
+
+@compiled
+def has_fitted(case: Case, n: int) -> bool:
+    """Whether the likeliest hypothesis has explained the mean for as long as it has not.
+
+    The mean of a unit that is wrong as a whole looks like a fault of one channel at times.
+    """
+    if number_in(case.inference.likeliest, n) > 2:
+        return True
+    first, last = ends_of(case.inference.likeliest, n)
+    return case.unfit[first, last] == 0.0
+
+
+@compiled
+def unfit_channels(case: Case, n: int) -> int:
+    """Return the channels of which a fault of each alone has not explained the means lately."""
+    mask = 0
+    for i in range(n):
+        if case.unfit[i, i] > 0.0:
+            mask |= 1 << i
+    return mask
+
+
+@compiled
+def forget_fits(case: Case, n: int, seconds: float) -> None:
+    """Forget so many seconds of the time in which faults have not explained the mean."""
+    for i in range(n):
+        for j in range(n):
+            case.unfit[i, j] = max(case.unfit[i, j] - seconds, 0.0)
+
+
+@compiled
 def isolate(params: Constants, kf: Estimator, case: Case) -> None:
     """Isolate the channels that all likely hypotheses have had in common for long enough."""
     inference = case.inference
@@ -672,7 +734,8 @@ def isolate(params: Constants, kf: Estimator, case: Case) -> None:
     # A single outlying value decides nothing, whatever the odds.
     may_be_spike = 0 < kf.far_samples < params.least
     settled = stood >= time_to_settle(params, inference)
-    if inference.common and settled and not may_be_spike:
+    fitted = settled and inference.common and has_fitted(case, params.sensors.n)
+    if fitted and not may_be_spike:
         case.isolated = inference.common
     elif not inference.common & case.isolated:
         case.isolated = 0

@@ -137,6 +137,7 @@ class Inference:
     amplitude: Vector  # estimated f, rad/s
     fit: Real  # part of ``total`` that the last hypothesis explains with its best amplitude
     count: Whole  # number of hypotheses
+    small: Whole  # of these the first ones, of one channel or two
     odds: Odds  # log odds, later shares
     fits: Odds  # ``fit`` of each hypothesis
     errors: Errors  # error of each channel by each hypothesis, rad/s
@@ -537,6 +538,14 @@ def largest_of(inference: Inference) -> int:
 
 
 @compiled
+def leaves_noise(inference: Inference, n: int, k: int) -> bool:
+    """Whether hypothesis k leaves only noise of the mean."""
+    free = redundancy(inference.mask & ~inference.members[k], n)
+    rest = 2.0 * (inference.total - inference.fits[k])
+    return rest <= FIT + FIT_PER_CHECK * max(free, 0)
+
+
+@compiled
 def update_best(inference: Inference, n: int) -> None:
     """Record the likeliest hypothesis, and whether it leaves only noise."""
     best = largest_of(inference)
@@ -544,10 +553,7 @@ def update_best(inference: Inference, n: int) -> None:
     inference.likeliest = inference.members[best]
     inference.shift = inference.shifts[best]
     inference.fit_of_best = inference.fits[best]
-    free = redundancy(inference.mask & ~inference.likeliest, n)
-    inference.fitted = 2.0 * (
-        inference.total - inference.fit_of_best
-    ) <= FIT + FIT_PER_CHECK * max(free, 0)
+    inference.fitted = leaves_noise(inference, n, best)
     inference.largest = 0.0
     for i in range(n):
         if inference.likeliest >> i & 1:
@@ -615,6 +621,7 @@ def explain(params: Constants, inference: Inference) -> None:
             inference.total += 0.5 * inference.u[i] * inference.y[i]
     inference.count = 0
     add_channels(inference, n)
+    inference.small = inference.count
     add_units(params, inference)
     if inference.may_shift:
         add_shifts(inference, n, params.largest_move)

@@ -24,12 +24,14 @@ from fdi_ros.detectors.case import (
     State,
     follow_case,
     forget_evidence,
+    forget_fits,
     goes_too_far,
     keep_information,
     look_for_case,
     look_for_change_in_hole,
     look_for_drift,
     undo_move,
+    unfit_channels,
 )
 from fdi_ros.detectors.sums import (
     fill_scores,
@@ -153,6 +155,7 @@ def update_mask(params: Constants, state: State, sample: SampleInput) -> None:
     blamed = case.isolated if case.isolated else case.suspects
     if case.open and blamed & ~sample.out == 0:
         forget_evidence(params, state)
+        forget_fits(case, params.sensors.n, math.inf)
         kf.mask = 0
     for i in range(params.sensors.n):
         if sample.out >> i & 1 and kf.doubt[i] > 0.0:
@@ -173,6 +176,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     n = params.sensors.n
     noise = kf.noise
     learns = not case.open
+    forget_fits(case, n, kf.span if learns else 0.0)
     close_turn(params, kf)
     update_largest_rate(
         noise, kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
@@ -274,6 +278,7 @@ def forget_suspicion(params: Constants, state: State) -> None:
     state.cleared = False
     state.declared = 0
     forget_evidence(params, state)
+    forget_fits(case, params.sensors.n, math.inf)
     forget_doubt(kf, params.sensors.n)
     forget_motion(kf, params.sensors.n)
     kf.mask = 0
@@ -326,6 +331,7 @@ def fill_verdict(
     # The channels may disagree beyond the model, as in a shock at unequal sampling instants.
     chi_ratio = 1.0 if case.open else kf.chi_ratio
     fill_scores(params, state.estimator, state.scales, verdict.scores)
+    sample.estimate.unclear = unfit_channels(case, n)
     for i in range(n):
         variance = kf.shared.level[i] * chi_ratio
         # What other channels share with this one is no noise of its own.

@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The published covariance is true where little or nothing checks the channels.
+"""The published covariance is true where little or nothing checks the channels, and no healthy gyro is named.
 
 The flights are those of ``benchmark/physics.py``. NEES is bounded from below as well: a covariance that claims too
 little is of no use.
@@ -56,3 +56,21 @@ def test_the_covariance_is_true_without_redundancy(mounting, name):
 def test_a_bias_that_was_never_learned_is_in_the_covariance(mounting):
     found = flown(mounting, "one unit ever", bias__startup_bias_duration=0.0)
     assert 0.1 < found["nees"].mean() < 2.0, found
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "seeds"),
+    [
+        ("unit x0.5", 0.0, (53, 54)),
+        ("unit turned", 0.0, (51, 52)),
+    ],
+)
+def test_no_healthy_gyro_is_named_where_no_fault_of_one_explains(name, size, seeds):
+    """A unit is wrong as a whole, or all gyros warm before one fails."""
+    label = f"cone, 100 Hz, {name}"
+    pipeline = Pipeline.from_config(config_of("cone", 100.0, {}, Asked()))
+    for seed in seeds:
+        words = (label, "t_01", 0) if size else (label, 0)
+        flight = fly(pipeline, "cone", name, size, Asked(1, seed).rng(*words))
+        assert not flight.wrong, seed
+        assert (flight.named if size else flight.unit) < 1.0, seed
