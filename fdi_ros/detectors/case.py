@@ -125,7 +125,7 @@ MOVE_TIME = 1.0
 thermal shocks of 6 mrad/s a healthy gyro is named in 17 of 48 flights without this, in 9
 with 5 s, and in 2 with 1 s."""
 SLOW = 2.0
-"""Time from the onset to a case, s, from which the evidence has grown slowly, up to `WARMS`:
+"""Time from the onset to a candidate, s, from which the evidence has grown slowly, up to `WARMS`:
 a step of 0.02 rad/s opens a case within 0.6 s, and what grows for longer is no warming."""
 STARTS = 0.25  # s within which a boost or motors start
 UNSTEADY = 0.25
@@ -312,7 +312,6 @@ def open_case(params: Constants, state: State, least: float) -> None:
     case.unsolved = 0.0
     copy_states(params.layout, kf.states, case.before)
     since = (kf.samples - case.onset) * params.period
-    case.inference.slow = params.bias_move > 0.0 and SLOW < since < WARMS
     before = kf.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
     if case.onset == kf.hole_sample + 1:
         before = kf.hole_at
@@ -471,6 +470,10 @@ def name_channels(params: Constants, state: State) -> None:
     if (kf.samples - kf.returned) * params.period > LEAST_RETURN:
         # A mean across a gap belongs to different motion.
         size = min(size, kf.samples - kf.returned + 1)
+    # A fault that began suddenly has been the candidate since then.
+    since = case.since if case.candidate else kf.samples
+    grown = (since - case.onset) * params.period
+    inference.slow = params.bias_move > 0.0 and SLOW < grown < WARMS
     case.louder = fill_louder(params, state, size)
     if case.isolated == 0 and case.healthy_move > 0.0:
         find_sudden(params, kf, case)

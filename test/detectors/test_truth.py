@@ -63,6 +63,7 @@ def test_a_bias_that_was_never_learned_is_in_the_covariance(mounting):
     [
         ("unit x0.5", 0.0, (53, 54)),
         ("unit turned", 0.0, (51, 52)),
+        ("warming 20 mrad/s", 0.1, (55,)),
     ],
 )
 def test_no_healthy_gyro_is_named_where_no_fault_of_one_explains(name, size, seeds):
