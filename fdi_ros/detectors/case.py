@@ -670,13 +670,19 @@ def explain_case(
 
 @compiled
 def follow_fits(params: Constants, case: Case, seconds: float) -> None:
-    """Follow for how long each fault of one channel or two has not explained the mean."""
+    """Follow for how long each fault of one channel or two has not explained the mean.
+
+    A mean that is noise without any fault, as in slow motion, says nothing of them.
+    """
     inference = case.inference
     n = params.sensors.n
+    if leaves_noise(inference, n, 0, 0.0):
+        return
     for k in range(inference.small):
-        first, last = ends_of(inference.members[k], n)
-        passed = -seconds if leaves_noise(inference, n, k) else seconds
-        unfit = case.unfit[first, last] + passed
+        members = inference.members[k]
+        first, last = ends_of(members, n)
+        fits = leaves_noise(inference, n, members, inference.fits[k])
+        unfit = case.unfit[first, last] + (-seconds if fits else seconds)
         case.unfit[first, last] = min(max(unfit, 0.0), UNSOLVED)
 
 
@@ -712,6 +718,12 @@ def unfit_channels(case: Case, n: int) -> int:
         if case.unfit[i, i] > 0.0:
             mask |= 1 << i
     return mask
+
+
+@compiled
+def fade_fits(case: Case, n: int, seconds: float) -> None:
+    """Forget within `WARMS` without a case which faults have not explained the mean."""
+    forget_fits(case, n, seconds * UNSOLVED / WARMS)
 
 
 @compiled

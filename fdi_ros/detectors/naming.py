@@ -538,10 +538,10 @@ def largest_of(inference: Inference) -> int:
 
 
 @compiled
-def leaves_noise(inference: Inference, n: int, k: int) -> bool:
-    """Whether hypothesis k leaves only noise of the mean."""
-    free = redundancy(inference.mask & ~inference.members[k], n)
-    rest = 2.0 * (inference.total - inference.fits[k])
+def leaves_noise(inference: Inference, n: int, members: int, fit: float) -> bool:
+    """Whether a hypothesis leaves only noise of the mean, of which it explains ``fit``."""
+    free = redundancy(inference.mask & ~members, n)
+    rest = 2.0 * (inference.total - fit)
     return rest <= FIT + FIT_PER_CHECK * max(free, 0)
 
 
@@ -553,7 +553,9 @@ def update_best(inference: Inference, n: int) -> None:
     inference.likeliest = inference.members[best]
     inference.shift = inference.shifts[best]
     inference.fit_of_best = inference.fits[best]
-    inference.fitted = leaves_noise(inference, n, best)
+    inference.fitted = leaves_noise(
+        inference, n, inference.likeliest, inference.fit_of_best
+    )
     inference.largest = 0.0
     for i in range(n):
         if inference.likeliest >> i & 1:

@@ -22,6 +22,7 @@ from fdi_ros.core.subsets import all_sets, mask_of
 from fdi_ros.detectors.base import Detector
 from fdi_ros.detectors.case import (
     State,
+    fade_fits,
     follow_case,
     forget_evidence,
     forget_fits,
@@ -176,7 +177,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     n = params.sensors.n
     noise = kf.noise
     learns = not case.open
-    forget_fits(case, n, kf.span if learns else 0.0)
+    fade_fits(case, n, kf.span if learns else 0.0)
     close_turn(params, kf)
     update_largest_rate(
         noise, kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
