@@ -563,3 +563,21 @@ def test_a_unit_that_is_silent_for_a_while_is_not_one_whose_values_come_and_go(
     assert declarations(pipeline, output) == []
     assert (output.state[1050:1300, 3:6] == ChannelState.STALE).all()
     assert (output.state[2000:, 3:6] == ChannelState.OK).mean() > 0.3
+
+
+@pytest.mark.parametrize("kind", ["inverted", "bias"])
+def test_a_channel_in_a_set_is_not_trusted_where_the_other_unit_misses_a_sample(kind):
+    """Of two units a fault leaves a set. Without the other unit nothing checks its members."""
+    pipeline = Pipeline(TWO)
+    block = stream(pipeline.geometry, 3000)
+    block.z[1000:, 4] = (
+        -block.z[1000:, 4] if kind == "inverted" else block.z[1000:, 4] + 2.0
+    )
+    block.z[1200::15, :3] = np.nan
+    output = pipeline.process(block)
+    assert (output.state[1200:, 4] == ChannelState.AMBIGUOUS).mean() > 0.5
+    error = np.abs(output.rate - body_rate(3000))
+    limit = 6.0 * np.sqrt(output.covariance[:, [0, 1, 2], [0, 1, 2]])
+    late = output.valid & (np.arange(3000) >= 1010)
+    assert late[1200::15].all()
+    assert (error < limit)[late].all()
