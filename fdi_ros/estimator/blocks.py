@@ -87,6 +87,7 @@ def update_acceleration(params: Constants, kf: Estimator) -> float:
     # Vibration faster than a block is not resolved, so its traces must not be learned as a delay.
     is_shaken = is_whole and contradiction > TURNING_RATIO * of_ends
     kf.shaken = contradiction if is_shaken else 0.0
+    kf.usual_shaken += (kf.shaken - kf.usual_shaken) / REST_BLOCKS
     return noise
 
 

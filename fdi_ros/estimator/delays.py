@@ -40,13 +40,27 @@ def update_time_offsets(params: Constants, kf: Estimator) -> None:
 
 
 @compiled
+def unresolved_share(params: Constants, kf: Estimator, u: int) -> float:
+    """Share of the angular acceleration, squared, of unit u that blocks do not resolve.
+
+    It may be vibration near the sample rate, which looks like a slow turn with any delay.
+    """
+    turn_square = 0.0
+    for i in range(params.sensors.n):
+        if params.unit[i] == u:
+            turn_square += kf.turn_square[i]
+    return min(kf.usual_shaken / max(turn_square, 1e-12), 1.0)
+
+
+@compiled
 def transfer_delays(params: Constants, kf: Estimator) -> bool:
     """Move sure delays from their states to ``late``, which `restamp` compensates. Return whether any moved."""
     changed = False
     for u in range(1, params.units):
         place = params.layout.delays[u]
         delay = kf.states.x[place]
-        variance = kf.states.p[place, place]
+        unresolved = params.layout.prior[place] * unresolved_share(params, kf, u)
+        variance = kf.states.p[place, place] + unresolved * unresolved
         if (
             abs(delay) > LEAST_COMPENSATED_DELAY
             and delay * delay > SURE_DELAY * variance

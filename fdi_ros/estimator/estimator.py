@@ -254,6 +254,7 @@ class Estimator:
     incoherent: Channels
     turning: Flag  # the angular acceleration exceeds noise
     shaken: Real  # square of the acceleration that blocks are too slow for, (rad/s^2)^2
+    usual_shaken: Real  # its average in the last second, (rad/s^2)^2
     turn_noise: Real  # its variance, (rad/s^2)^2
     peak_turn: Channels  # lately largest, rad/s^2
     extra: Channels  # variance of a block beyond noise and states, (rad/s)^2

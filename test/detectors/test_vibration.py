@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdi_ros import Pipeline
+from fdi_ros import Block, Pipeline
 
 # For this import alone: a module there has the name of a folder of tests.
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmark"))
 import physics
-from trials import Asked
+from trials import START, Asked
 from vibration import CONDITIONS, config_of, judged
 
 sys.path.pop(0)
@@ -83,3 +83,33 @@ def test_six_gyros_that_warm_name_none_of_them():
     pipeline = Pipeline.from_config(physics.config_of("cone", 50.0, {}, asked))
     rng = asked.rng(label, 0)
     assert not physics.fly(pipeline, "cone", "warming 20 mrad/s", 0.0, rng).wrong
+
+
+@pytest.mark.parametrize("seed", [5, 17, 21])
+def test_vibration_near_the_sample_rate_is_no_delay(seed):
+    """It looks like a slow turn, which a unit 0.6 ms late shows as if it were several ms late."""
+    settings = {
+        "noise.noise_std": (0.001,),
+        "noise.scale_std": (0.005,),
+        "imus.mounts": (),
+    }
+    pipeline = Pipeline.from_config(config_of(2, 100.0, Asked(settings=settings)))
+    rng = np.random.default_rng(seed)
+    slow, phase = rng.uniform(0.3, 1.2, 3), rng.uniform(0.0, 2.0 * np.pi, 3)
+    hertz, shifted = rng.uniform(103.0, 117.0), rng.uniform(0.0, 2.0 * np.pi, 3)
+    shaken = 0.13 * rng.uniform(0.2, 1.0, 3)
+
+    def rate_at(t):
+        turn = 1.5 * np.sin(2.0 * np.pi * np.outer(t, slow) + phase)
+        vibration = shaken * np.sin(2.0 * np.pi * hertz * t[:, None] + shifted)
+        return np.clip((t - 8.0) / 2.0, 0.0, 1.0)[:, None] * (turn + vibration)
+
+    t = np.arange(4000) / 100.0
+    z = np.hstack([rate_at(t), rate_at(t - 0.0006)])
+    z += 0.001 * rng.standard_normal(z.shape) + rng.normal(0.0, 0.005, 6)
+    output = pipeline.process(Block(START + np.round(1e9 * t).astype(np.int64), z))
+    error = (output.rate - rate_at(t + (output.instant - output.stamp) * 1e-9))[900:]
+    covariance = output.covariance[900:]
+    weighed = np.linalg.solve(covariance, error[..., None])[..., 0]
+    assert 0.05 < (error * weighed).sum(axis=1).mean() / 3.0 < 2.0
+    assert not any(event.declares for event in output.events)
