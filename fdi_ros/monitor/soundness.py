@@ -108,9 +108,11 @@ class UnitHealth:
     slow_rate_hz: float | None = None
     """Messages per second during that time, Hz. Live: lately."""
     delay_s: float | None = None
-    """Delay of its stamps against the first unit, s. Negative: early. None: not measured."""
+    """Delay of its stamps against those of `delay_to`, s. Negative: early. None: not measured."""
     delay_std_s: float | None = None
     """Standard deviation of the delay, s."""
+    delay_to: str = ""
+    """Unit that the delay refers to, the one in the middle of three or more. Empty: not measured."""
     copy_of: str = ""
     """Unit of which it repeats the values. Empty: none."""
     origin: str = ""

@@ -369,23 +369,22 @@ class Judge(Walk):
     def _units(self, status: Status) -> Iterator[UnitHealth]:
         """Yield the health of each unit, or of the one topic with all channels."""
         source = source_of(self.pipeline.config)
-        late = {
-            unit.name: (delay, std)
-            for unit, delay, std in zip(
-                status.units, status.delays, status.delay_std, strict=False
-            )
-        }
+        measured = {unit.name: unit for unit in status.units if unit.against}
         # The status names copies with their topics: "imu_2 (/imu_2/data)".
         copies = {second: first for first, second in status.copies}
         for name, topic in zip(source.names, source.topics, strict=True):
-            delay, std = late.get(name, (None, None))
-            yield UnitHealth(
-                name=name,
-                topic=topic,
-                delay_s=delay,
-                delay_std_s=std,
-                copy_of=copies.get(f"{name} ({topic})", ""),
+            health = UnitHealth(
+                name=name, topic=topic, copy_of=copies.get(f"{name} ({topic})", "")
             )
+            if unit := measured.get(name):
+                # The same reference as in the notes, which are the monitor's.
+                health = replace(
+                    health,
+                    delay_s=unit.delay,
+                    delay_std_s=unit.delay_std,
+                    delay_to=unit.against,
+                )
+            yield health
 
     @property
     def _end(self) -> float:

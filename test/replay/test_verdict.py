@@ -111,6 +111,11 @@ def test_the_first_line_of_a_case(file, code, sentence, fdi, tmp_path):
             " What to do: choose a larger range for /imu_0, /imu_1 and /imu_2",
         ),
         (
+            CASES / "spikes_5_every_1s.csv",
+            "/imu_1 has spikes of one sample: 24 in y."
+            " What to do: check wiring and power supply of /imu_1",
+        ),
+        (
             SITL / "calm.tlog",
             "/imu_1, /imu_2 and /imu_3 repeat one value for long, in 67% of the messages."
             " What to do: check the driver of /imu_1, /imu_2 and /imu_3 if the vehicle moved"
@@ -317,6 +322,29 @@ def test_the_verdict_names_what_is_wrong_and_not_what_was_doubted(
 ):
     out = fdi("replay", three_units(tmp_path / "three.csv", strike)).out
     assert re.match(sentence, out.splitlines()[0]), out
+
+
+def test_delays_in_the_table_and_in_the_notes_have_one_reference(fdi, tmp_path):
+    """The stamps of the first unit are 20 ms late, so both refer to another one."""
+    table = np.loadtxt(
+        three_units(tmp_path / "three.csv", lambda time, rates: None),
+        delimiter=",",
+        skiprows=1,
+    )
+    table[2:, 1:4] = table[:-2, 1:4]
+    head = ",".join(["time", *(name.replace(".", "_") for name in UNITS)])
+    late = tmp_path / "late.csv"
+    np.savetxt(late, table, "%.7f", delimiter=",", header=head, comments="")
+    out = fdi("replay", late).out
+    (reference,) = re.findall(r"delay to (imu_\d)", out)
+    noted = re.findall(
+        r"(imu_\d) as a whole: its stamps are .* late against (.*)'s", out
+    )
+    assert ("imu_0", reference) in noted
+    row = next(line for line in out.splitlines() if line.startswith("  imu_0 "))
+    late_ms = re.search(r"(-?[\d.]+) ms", row)
+    assert late_ms is not None
+    assert float(late_ms[1]) == pytest.approx(20.0, abs=2.0)
 
 
 # Deliveries and values
