@@ -34,6 +34,16 @@ SLOW_SHARE = 0.6
 """Share of the usual count below which a unit is slow."""
 LEAST_SLOW = 3
 """Windows in a row that a unit is slow at least."""
+INTERVAL_BINS = 400
+"""Bins for the intervals between messages, enough for 10 us to 1.3 hours."""
+SHORTEST_INTERVAL = 1e-5
+"""Lower edge of the first bin, s."""
+BIN_RATIO = 1.05
+"""Upper over lower edge of a bin. Three bins together are 15 % wide."""
+STEADY_SHARE = 0.5
+"""Share of the intervals in the bin of their median and beside it, from which on messages
+have a usual interval. With losses at random it is the share of the messages that arrive;
+arrival times without order have a tenth there, and no usual interval."""
 
 NOISE_WINDOW = 3.0
 """Duration of a window in which noise is measured, s: some swings of a loose mount."""
@@ -68,6 +78,12 @@ class Deliveries:
         """Time of recording of the first message, ns."""
         self._last = 0
         """Latest time of recording, ns."""
+        self._newest = np.full(topics, -1, dtype=np.int64)
+        """Time of recording of the last message of each topic, ns. -1: none."""
+        self._intervals = np.zeros((topics, INTERVAL_BINS), dtype=np.int64)
+        """Number of intervals between messages by their length."""
+        self._lengths = np.zeros((topics, INTERVAL_BINS))
+        """Their sums, s."""
 
     def tap(self, batch: Batch, rows: Int) -> None:
         """Count some rows of a batch of raw messages."""
@@ -83,7 +99,35 @@ class Deliveries:
             self._counts = np.hstack([halved, np.zeros_like(halved)])
             self._width *= 2
         windows = (since / self._width).astype(np.intp)
-        np.add.at(self._counts, (batch.topic[rows], windows), 1)
+        topics = batch.topic[rows]
+        np.add.at(self._counts, (topics, windows), 1)
+        for k in np.unique(topics).tolist():
+            self._tap_intervals(k, times[topics == k])
+
+    def _tap_intervals(self, k: int, times: Int) -> None:
+        """Take the times of recording of further messages of topic k, ns."""
+        before = times[:1] if self._newest[k] < 0 else self._newest[k : k + 1]
+        steps = np.diff(np.concatenate([before, times])) * 1e-9
+        steps = steps[steps > 0.0]
+        bins = np.log(steps / SHORTEST_INTERVAL) / np.log(BIN_RATIO)
+        bins = np.clip(bins, 0, INTERVAL_BINS - 1).astype(np.intp)
+        np.add.at(self._intervals[k], bins, 1)
+        np.add.at(self._lengths[k], bins, steps)
+        self._newest[k] = times[-1]
+
+    def _steady_rate(self, k: int) -> float:
+        """Return the rate of topic k by the interval that most of its messages have, Hz.
+
+        0: they have no such interval. Messages that are lost at random shorten no interval,
+        but lower every count.
+        """
+        counts = self._intervals[k]
+        middle = int(np.searchsorted(counts.cumsum(), 0.5 * counts.sum()))
+        near = slice(max(middle - 1, 0), middle + 2)
+        alike = int(counts[near].sum())
+        if alike < max(STEADY_SHARE * counts.sum(), MESSAGES_IN_WINDOW):
+            return 0.0
+        return float(alike / self._lengths[k, near].sum())
 
     def result(self) -> list[Delivery]:
         """Return how each topic delivered."""
@@ -106,7 +150,9 @@ class Deliveries:
         counts = counts.reshape(len(counts), -1, together).sum(axis=2)
         if counts.shape[1] < 2 * LEAST_SLOW:
             return [Delivery(1.0, None) for _ in counts]
-        usual: Array = np.maximum(np.quantile(counts, USUAL_QUANTILE, axis=1), 1.0)
+        steady: Array = np.array(list(map(self._steady_rate, range(len(counts)))))
+        most = np.quantile(counts, USUAL_QUANTILE, axis=1)
+        usual: Array = np.maximum(np.maximum(most, width * steady), 1.0)
         shares = counts / usual[:, None]
         # Messages that the recorder lost are missing on all topics.
         recorded = shares.max(axis=0)
@@ -115,6 +161,7 @@ class Deliveries:
         # The quantile is a little more than the mean of the windows of a usual rate.
         full = counts >= USUAL_SHARE * usual[:, None]
         rates = (counts * full).sum(axis=1) / np.maximum(full.sum(axis=1), 1) / width
+        rates = np.maximum(rates, steady)
         return [
             _delivery(np.asarray(np.minimum(own, 1.0)), times, width, rate)
             for own, rate in zip(shares, rates.tolist(), strict=True)

@@ -390,6 +390,27 @@ def test_what_the_recorder_loses_of_all_units_is_no_fault_of_one(rate, ratio):
         assert delivery.slow_from is None
 
 
+@given(st.floats(20.0, 400.0), st.floats(0.0, 0.4), st.integers(0, 9))
+def test_messages_lost_at_random_are_missing(rate, lost, seed):
+    """No second has them all, so counts alone do not show the usual rate."""
+    steady = np.arange(0.0, 60.0, 1 / rate)
+    left = steady[np.random.default_rng(seed).random(len(steady)) >= lost]
+    whole, part = tapped([steady, left], 2)
+    assert whole.share > 0.95
+    assert part.share == pytest.approx(len(left) / len(steady), abs=0.04)
+    assert part.rate == pytest.approx(rate, rel=0.05)
+
+
+@given(st.floats(20.0, 200.0), st.floats(0.0, 3.0), st.integers(0, 9))
+def test_messages_that_arrive_irregularly_are_all_there(rate, spread, seed):
+    """Delays of up to some intervals shorten half of the intervals, and lose nothing."""
+    steady = np.arange(0.0, 60.0, 1 / rate)
+    delay = np.random.default_rng(seed).exponential(spread / rate, len(steady))
+    whole, late = tapped([steady, np.sort(steady + delay)], 2)
+    assert whole.share > 0.9
+    assert late.share > 0.9
+
+
 def test_memory_of_deliveries_does_not_grow_with_the_recording():
     long = np.arange(0.0, 3.0 * MOST_WINDOWS, 0.5)
     (delivery,) = tapped([long], 1)
