@@ -370,16 +370,14 @@ def bad_values(
     for one in chosen:
         name = one.topic.name
         if spiky := _spike_words(one):
-            words = f"{shown(name)} has spikes of one sample: {listed(spiky)}"
+            words = f"{shown(name)} has spikes: {listed(spiky)}"
             yield _look("spikes", words, Trouble.SPIKES, (name,), headline)
     frozen = {one.topic.name: _repeating(one) for one in chosen if _repeating(one)}
     if frozen and not saturated:
         names = [name for some in frozen.values() for name in some]
         share = max(float(one.repeats.count.max()) / one.received for one in chosen)
         verb = "repeats" if len(names) == 1 else "repeat"
-        words = (
-            f"{listed(names)} {verb} one value for long, in {share:.0%} of the messages"
-        )
+        words = f"{listed(names)} {verb} one value for long, in {100 * share:.0f} % of the messages"
         yield _look("frozen", words, Trouble.REPEATS, list(frozen), headline)
 
 
@@ -418,7 +416,7 @@ def frozen_words(chosen: Sequence[TopicReport]) -> str:
     share = max(shares[name] for name in frozen)
     verb = "repeats" if len(frozen) == 1 else "repeat"
     return (
-        f"{listed(frozen)} {verb} one value for long, in {share:.0%} of the messages, and the other"
+        f"{listed(frozen)} {verb} one value for long, in {100 * share:.0f} % of the messages, and the other"
         " units do not"
     )
 

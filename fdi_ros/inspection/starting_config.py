@@ -321,7 +321,7 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
     noise = [report.segments.noise() for report in chosen]
     share = min(one.share for one in noise)
     levels = np.concatenate([one.moving for one in noise])
-    words = f"in motion ({share:.0%} of the recording), vibration included"
+    words = f"in motion ({100 * share:.0f} % of the recording), vibration included"
     if not (share > 0.5 and np.isfinite(levels).all() and (levels > 0).all()):
         quiet = np.concatenate([one.quiet for one in noise])
         usable = np.isfinite(quiet) & (quiet > 0)

@@ -483,7 +483,7 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     )
     words += [report.copied] if report.copy_of else []
     words += (
-        [f"moving {report.segments.noise().share:.0%} of the time"]
+        [f"moving {100 * report.segments.noise().share:.0f} % of the time"]
         if report.complete
         else []
     )
@@ -518,8 +518,12 @@ def troubles(report: TopicReport, unit: Unit = RADIANS) -> list[str]:
     ):
         counted = zip(report.places, counts.tolist(), strict=True)
         lines = [f"{place} in {n}" for place, n in counted if n]
-        words += [f"{why}: {listed(lines)} messages"] if lines else []
+        noun = "message" if counts.max() == 1 else "messages"
+        words += [f"{why}: {listed(lines)} {noun}"] if lines else []
     words += [f"{report.malformed} malformed"] if report.malformed else []
-    words += [f"{report.backward} stamps do not increase"] if report.backward else []
+    if report.backward == 1:
+        words.append("1 stamp does not increase")
+    elif report.backward:
+        words.append(f"{report.backward} stamps do not increase")
     words += [burst_words(report)] if report.burst > 1 else []
     return words

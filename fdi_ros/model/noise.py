@@ -562,7 +562,7 @@ def summary_line(
     span = f"{' to '.join(ends)} {unit}" if ends else "none"
     isolable = int(geometry.isolable.sum())
     n = geometry.n
-    smallest_words = f"smallest error detected in one sample at rest with probability {DETECTION:.0%}: {span}"
+    smallest_words = f"smallest error detected in one sample at rest with probability {100 * DETECTION:.0f} %: {span}"
     if len(ends) > 1:
         smallest_words += ", depending on the channel"
     words = f"{n} channels, GDOP {geometry.gdop:.2f}; {smallest_words}"

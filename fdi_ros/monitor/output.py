@@ -228,7 +228,7 @@ class Output:
 
     def __repr__(self) -> str:
         seconds = (int(self.stamp[-1]) - int(self.stamp[0])) / 1e9 if len(self) else 0.0
-        rated = f", a rate in {np.mean(self.valid):.0%}" if len(self) else ""
+        rated = f", a rate in {100 * np.mean(self.valid):.0f} %" if len(self) else ""
         size = f"{len(self)} samples of {len(self.channel_names)} channels, {seconds:.3f} s"
         return f"Output({size}{rated}; {len(self.events)} changes of state)"
 

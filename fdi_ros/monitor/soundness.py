@@ -42,7 +42,7 @@ LEAST_OF_VISIBLE = 0.25
 """Smallest visible share of the errors of a channel, over the share with equal noise.
 So a noise below a third of that of all parallel channels counts as a third."""
 LEAST_SPIKES = 3
-"""Single wrong samples from which on a channel has spikes. Fewer may be chance."""
+"""Spikes from which on they are reported. Fewer may be chance."""
 
 
 class Word(str, Enum):
@@ -71,7 +71,7 @@ class ChannelHealth:
     delivered: float = 1.0
     """Share of the samples in which it gave a finite value."""
     spikes: int = 0
-    """Number of single wrong samples."""
+    """Number of its spikes: wrong values in a run of a few samples at most."""
     saturated_s: float = 0.0
     """Time at the end of its range, s."""
     own_noise_rad_s: float | None = None
@@ -392,7 +392,7 @@ def _spiky(some: Sequence[ChannelHealth]) -> list[Concern]:
             Word.LOOK,
             Trouble.SPIKES,
             (one.name,),
-            f"has {one.spikes} spikes of one sample",
+            f"has {one.spikes} spikes",
         )
         for one in some
     ]

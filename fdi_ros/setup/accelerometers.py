@@ -178,7 +178,7 @@ def _check_amount(data: Data, names: Sequence[str]) -> None:
     usual = float(np.median(share))
     if (least := float(share.min())) < LEAST_USABLE * max(usual, LEAST_USABLE):
         raise CalibrationError(
-            f"{names[int(share.argmin())]} gives a usable value in {least:.0%} of the samples"
+            f"{names[int(share.argmin())]} gives a usable value in {100 * least:.0f} % of the samples"
         )
 
 

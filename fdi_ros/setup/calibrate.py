@@ -301,7 +301,7 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
                 for why, count in data.unusable.items()
             )
             raise CalibrationError(
-                f"{name} gives a usable value in {share:.0%} of its samples, expected at least {LEAST_USABLE:.0%}"
+                f"{name} gives a usable value in {100 * share:.0f} % of its samples, expected at least {100 * LEAST_USABLE:.0f} %"
                 f" ({lost}): mend it or name it in excluded_channels"
             )
 
@@ -439,7 +439,7 @@ def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data
         group = [names[i] for i in np.flatnonzero(share > MOST_FAULTY)]
         first = next(span for span in clear if int(share.argmax()) in span.channels)
         raise DisagreementError(
-            f"{' or '.join(group)} disagrees with the others in {share.max():.0%} of the recording (from"
+            f"{' or '.join(group)} disagrees with the others in {100 * share.max():.0f} % of the recording (from"
             f" {first.start:.1f} s): faulty; repair it, leave this part out with --start and --end, or name it in"
             " excluded_channels"
         )

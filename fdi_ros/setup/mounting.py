@@ -355,7 +355,7 @@ def summary_lines(result: Mounting, unit: Unit = RADIANS) -> list[str]:
 def fault_sections(result: Mounting, unit: Unit = RADIANS) -> list[Section]:
     """Smallest faults: detected in one sample, and over time."""
     hint = (
-        f"Detected in one sample at rest with probability {DETECTION:.0%}, at a false-alarm probability of"
+        f"Detected in one sample at rest with probability {100 * DETECTION:.0f} %, at a false-alarm probability of"
         f" {result.false_alarm_probability:.3g} a sample. Smaller faults take longer, see below."
     )
     worst = np.array([sizes.max(axis=1) for sizes in result.waiting.values()])

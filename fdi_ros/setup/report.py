@@ -172,7 +172,7 @@ def _quietest(share: float) -> str:
     """Return in which part of the recording the noise is the quietest."""
     if share > 0.995:
         return "over the whole recording"
-    return f"in the quietest {share:.0%} of the recording"
+    return f"in the quietest {100 * share:.0f} % of the recording"
 
 
 def _position(axis: str, value: float, error: float) -> str:
@@ -235,7 +235,7 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
         words += " motors off"
         yield Finding(Role.UNKNOWN, "rest", words, error=common)
     elif share <= LEAST_SUPPORT:
-        words = f"noise_std is from the quietest {share:.0%} of the recording: a longer rest gives a better value"
+        words = f"noise_std is from the quietest {100 * share:.0f} % of the recording: a longer rest gives a better value"
         yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=LEAST_SUPPORT)
     error = result.axis_errors
     rms = np.std(found.rate, axis=0) * unit.factor
@@ -257,7 +257,7 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
         )
     if poor := [a for a in range(3) if SHOWN_AXES < error[a] <= UNMEASURED]:
         turns = ", ".join(
-            f"{'xyz'[a]} ({rms[a]:.2g} {unit.name} rms, axes +-{error[a]:.1%})"
+            f"{'xyz'[a]} ({rms[a]:.2g} {unit.name} rms, axes +-{100 * error[a]:.1f} %)"
             for a in poor
         )
         words = f"axes: too little rotation about {turns} of {body_frame}; the result stays near the configured axes."
@@ -577,7 +577,7 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         )
     elif tried.judged < LEAST_JUDGED:
         note = tried.note or "channels are missing"
-        words = f"the monitor judges only {tried.judged:.0%} of the samples in the proof: {note}"
+        words = f"the monitor judges only {100 * tried.judged:.0f} % of the samples in the proof: {note}"
         yield Finding(
             warning, "judged", words, (), tried.judged, None, LEAST_JUDGED, "DO NOT USE"
         )

@@ -140,7 +140,7 @@ class Proof:
             return f"the new settings declare {times_words(new)}"
         # Smaller losses occur at the edge of a gap.
         if before.judged - after.judged > 0.02:
-            return f"the new settings judge {after.judged:.0%} of the samples instead of {before.judged:.0%}"
+            return f"the new settings judge {100 * after.judged:.0f} % of the samples instead of {100 * before.judged:.0f} %"
         # One fewer is chance.
         if tried_before == tried and was - now > 1:
             return f"the new settings isolate {now} of {tried} biases instead of {was}"

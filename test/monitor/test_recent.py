@@ -60,7 +60,7 @@ def test_spikes_are_named_for_a_minute_and_forgotten():
     block.z[5 * SECOND : 20 * SECOND : SECOND, 4] += 5.0
     *_, at_30 = list(reports(block[: 30 * SECOND]))
     assert at_30["monitor"].value("verdict") == "LOOK"
-    assert "imu_2.y has 15 spikes of one sample" in at_30["monitor"].message
+    assert "imu_2.y has 15 spikes" in at_30["monitor"].message
     assert at_30["monitor"].message.startswith("8 of 9 channels healthy")
     assert at_30["imu_2.y"].level == Level.WARN
     *_, last = reports(block)

@@ -112,12 +112,12 @@ def test_the_first_line_of_a_case(file, code, sentence, fdi, tmp_path):
         ),
         (
             CASES / "spikes_5_every_1s.csv",
-            "/imu_1 has spikes of one sample: 24 in y."
+            "/imu_1 has spikes: 24 in y."
             " What to do: check wiring and power supply of /imu_1",
         ),
         (
             SITL / "calm.tlog",
-            "/imu_1, /imu_2 and /imu_3 repeat one value for long, in 67% of the messages."
+            "/imu_1, /imu_2 and /imu_3 repeat one value for long, in 67 % of the messages."
             " What to do: check the driver of /imu_1, /imu_2 and /imu_3 if the vehicle moved"
             " meanwhile; at rest, coarse values repeat by themselves",
         ),
@@ -151,7 +151,7 @@ def test_injected_spikes_are_said_of_their_channel_alone(fdi):
     said = fdi("replay", CASES / "clean.csv", *words).out
     lines = said.splitlines()
     assert "No other channel was declared faulty." in lines
-    assert re.fullmatch(r"imu_1\.y has \d\d spikes of one sample\.", lines[3])
+    assert re.fullmatch(r"imu_1\.y has \d\d spikes\.", lines[3])
     assert "noisier" not in said
 
 
@@ -439,7 +439,7 @@ def test_concerns_name_what_is_wrong_and_nothing_else():
     assert [str(one) for one in concerns_of([*fine, bad], [copy])] == [
         "b.x could be checked in only 40 % of the samples",
         "c repeats the values of a: one sensor, no redundancy",
-        "b.x has 5 spikes of one sample",
+        "b.x has 5 spikes",
     ]
 
 

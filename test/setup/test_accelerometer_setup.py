@@ -143,7 +143,7 @@ def test_in_one_attitude_scale_factors_are_not_measured():
         (
             slice(4, 5),
             lambda z: z * np.nan,
-            "gives a usable value in 0% of the samples",
+            "gives a usable value in 0 % of the samples",
         ),
     ],
 )

@@ -151,7 +151,7 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
     text = topics_text(reports, damage)
     assert "one value for 1 s or more: x in 150 and z in 200 messages" in text
     assert "1 malformed" in text
-    assert "1 stamps do not increase" in " ".join(text.split())
+    assert "1 stamp does not increase" in " ".join(text.split())
 
 
 @pytest.mark.parametrize("which", ["flight", "recording"])

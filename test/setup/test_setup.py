@@ -339,7 +339,7 @@ def test_settings_beside_a_unit_that_repeats_one_value_are_not_for_flight(
     assert made.code == 3
     first = made.out.splitlines()[0]
     assert re.match(
-        rf"DO NOT USE: {TOPICS[1]} repeats one value for long, in 90% of the messages, and"
+        rf"DO NOT USE: {TOPICS[1]} repeats one value for long, in 90 % of the messages, and"
         r" the other units do not\. What to do: check driver and bus, and record again",
         first,
     ), first
@@ -547,7 +547,7 @@ def test_settings_no_better_than_before_do_not_hide_that_no_test_fault_was_isola
         calibration=object(),
         config=Config.from_file(ROOT / "config" / "two_imus.yaml"),
         chosen=(),
-        kept="the new settings judge 90% of the samples instead of 92%",
+        kept="the new settings judge 90 % of the samples instead of 92 %",
         proof=SimpleNamespace(
             source="the last 37 s",
             apart=True,
