@@ -112,6 +112,14 @@ class Samples:
             self.topics, 0
         )  #: malformed messages of each topic
         self.disordered = 0  #: messages without a stamp recorded before one that was handed on already: left out
+        self.recorded_back_s = 0.0
+        """Longest step back of the times of recording of a topic, in the order of the file, s."""
+        self._recorded = np.full(len(self.topics), -1, dtype=np.int64)
+        """Time of recording of the last message read of each topic, ns. -1: none."""
+        self._stamped = self._recorded.copy()
+        """Stamp of the last message of each topic, ns. -1: none."""
+        self._set_back = np.zeros(len(self.topics), dtype=np.int64)
+        """Longest step back of the stamps of each topic, ns."""
         self.progress = 0.0  #: share of the recording read so far
         self.newest = [Newest() for _ in self.topics]
         """Last message of each topic so far, if blocks are cut by period."""
@@ -127,6 +135,10 @@ class Samples:
             self.messages += len(messages)
             if self.period:
                 self._note_newest(messages)
+            for k in np.unique(messages["topic"]).tolist():
+                stamps = messages["stamp"][messages["topic"] == k]
+                step = _largest_step_back(self._stamped, k, stamps)
+                self._set_back[k] = max(self._set_back[k], step)
             block = self._block(messages)
             self._check_rate(block.stamp)
             yield block
@@ -253,6 +265,7 @@ class Samples:
         waiting = np.empty(0, self._row)
         done = -1
         for batch in self.recording.batches(self.topics):
+            self._note_steps_back(batch)
             waiting = np.concatenate([waiting, self._decoded(batch)])
             if (np.diff(waiting["log_time"]) < 0).any():
                 waiting = waiting[np.argsort(waiting["log_time"], kind="stable")]
@@ -278,6 +291,22 @@ class Samples:
                 yield messages
         if len(waiting):
             yield waiting
+
+    def _note_steps_back(self, batch: Batch) -> None:
+        """Note by how much times of recording go back."""
+        for k in np.unique(batch.topic).tolist():
+            times = batch.log_time[batch.topic == k]
+            step = _largest_step_back(self._recorded, k, times)
+            self.recorded_back_s = max(self.recorded_back_s, 1e-9 * step)
+
+    @property
+    def set_back_s(self) -> float:
+        """By how much the stamps of all units were set back together, s. 0: never."""
+        row = self.alignment.rows[0]
+        least = int(self._set_back.min())
+        if not self.source.stamped or not row["restarts"] or least <= row["timeout"]:
+            return 0.0
+        return 1e-9 * least
 
     def _decoded(self, batch: Batch) -> Rows:
         """Decode a batch; malformed messages and those outside the span are left out."""
@@ -307,6 +336,14 @@ class Samples:
         for tap in self._taps:
             tap(batch, np.flatnonzero(keep))
         return messages[keep]
+
+
+def _largest_step_back(last: Int, k: int, times: Int) -> int:
+    """Return the largest step back among further times (k,) of topic k, ns, and keep the last."""
+    before = times[:1] if last[k] < 0 else last[k : k + 1]
+    steps = np.diff(np.concatenate([before, times]))
+    last[k] = times[-1]
+    return max(0, -int(steps.min()))
 
 
 def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None:

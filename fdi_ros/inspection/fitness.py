@@ -44,6 +44,8 @@ DEFAULT_TIMEOUT = float(PARAMETERS["imus.timeout"].default)
 _PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
 #: largest share of messages recorded before the one ahead of them: a clock is set seldom
 MOST_DISORDERED = 0.1
+#: share of stamps that do not increase, from which on to look: not a message that came twice
+MANY_STAMPS = 0.01
 #: share of the values of a gyro that are repeated for long, from which on to look
 MUCH_FROZEN = 0.1
 #: the same, from which on most of what a unit sends measures nothing
@@ -299,8 +301,7 @@ def recording_findings(
         )
     for topic, words in unused_topics(reports, unread):
         yield _look("left out", words, Trouble.LEFT_OUT, (topic,))
-    for topic, words in _slow_topics(chosen):
-        yield _look("delivered", words, Trouble.DELIVERY, (topic,))
+    yield from message_findings(chosen)
     yield from bad_values(chosen)
     units = len(chosen) > 1
     names = [
@@ -338,6 +339,26 @@ def unused_topics(
         for topic, why in (*left_out(reports), *unread)
         if _NO_REDUNDANCY not in why
     ]
+
+
+def message_findings(
+    chosen: Sequence[TopicReport], headline: str = "READY, BUT LOOK"
+) -> Iterator[Finding]:
+    """Yield units that lack messages, and those with stamps that are not of their measurement."""
+    for topic, words in _slow_topics(chosen):
+        yield _look("delivered", words, Trouble.DELIVERY, (topic,), headline)
+    if set_back := [one for one in chosen if one.set_back > DEFAULT_TIMEOUT]:
+        names = [one.topic.name for one in set_back]
+        size = figures(max(one.set_back for one in set_back))
+        words = f"the stamps of {listed(list(map(shown, names)))} go back by up to {size} s: a clock was set"
+        yield _look("clock", words, Trouble.CLOCK, names, headline)
+    for one in chosen:
+        if one.backward >= MANY_STAMPS * one.received:
+            words = (
+                f"{shown(one.topic.name)} repeats old stamps in"
+                f" {figures(100 * one.backward / one.received, 2)} % of its messages: these are not used"
+            )
+            yield _look("stamps", words, Trouble.STAMPS, (one.topic.name,), headline)
 
 
 def _slow_topics(chosen: Sequence[TopicReport]) -> Iterator[tuple[str, str]]:

@@ -70,6 +70,8 @@ class TopicReport:
     longest: float = 0.0
     #: stamps that do not increase
     backward: int = 0
+    #: longest step back of the stamps, s
+    set_back: float = 0.0
     #: messages with a time of recording before that of the message ahead of them
     disordered: int = 0
     #: lead of the first stamps over their times of recording, s, NaN if not stamped
@@ -319,7 +321,8 @@ def _take_stamps(report: TopicReport, stamp: Int) -> None:
         return
     first, *before = (int(stamp[0]),) if report.stamps is None else report.stamps
     steps = np.diff(np.concatenate([before, stamp])) * 1e-9
-    report.backward += int((np.diff(stamp) <= 0).sum())
+    report.backward += int((steps <= 0.0).sum())
+    report.set_back = max(report.set_back, -float(steps.min(initial=0.0)))
     if report.received <= MOST_INTERVALS:
         report.stamp_steps.append(steps)
     report.stamps = first, int(stamp[-1])

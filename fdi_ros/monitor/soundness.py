@@ -142,6 +142,13 @@ class Trouble(Enum):
     )
     LEFT_OUT = "to judge {who} too, mend what is wrong, or choose the units in a config (--config)"
     DELIVERY = "check connection, driver and bus load of {who}"
+    STAMPS = (
+        "check the driver of {who}: every message needs the time of its measurement"
+    )
+    CLOCK = (
+        "judge the parts before and after apart (--start, --end), and set clocks only before a"
+        " recording"
+    )
     COPY = "give {who} a sensor of its own: check wiring and driver"
     DOUBT = "make a longer recording: the suspicion of {who} is still open"
     END_OF_RANGE = "choose a larger range for {who}"

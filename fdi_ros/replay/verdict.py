@@ -49,11 +49,14 @@ def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
             tuple(names),
         )
     if why := unjudged_words(judgement):
-        sentence = f"CANNOT TELL: {why}. What to do: {_to_judge(judgement)}."
+        clocks = "".join(f" {one.sentence}" for one in set_clocks(judgement))
+        sentence = f"CANNOT TELL: {why}.{clocks} What to do: {_to_judge(judgement)}."
         return ReplayVerdict(Word.CANNOT_TELL.value, sentence, ())
     concerns = judgement.concerns
     word = word_of(concerns)
-    deciding = [one for one in concerns if one.word is word]
+    deciding = [
+        one for one in concerns if one.word is word or one.trouble is Trouble.CLOCK
+    ]
     names = dict.fromkeys(name for one in deciding for name in one.who)
     seconds = judgement.scores.duration_s
     if word is Word.HEALTHY:
@@ -209,11 +212,28 @@ def _faulty_sentences(
         ]
     if first.since_s - first.start_s >= LEAST_BEFORE:
         sentences.append(f"First seen at {first.start_s:.1f} s.")
-    others = dict.fromkeys(one.who for one in faulty[1:] if one.who != first.who)
+    lasting = _without_brief_sets(faulty)
+    others = dict.fromkeys(one.who for one in lasting[1:] if one.who != first.who)
     if others:
         sentences.append(f"Also {first_of(list(others), MOST_TOLD)}.")
+    sentences += [one.sentence for one in set_clocks(judgement)]
     sentences += [f"{one}." for one in noise_behind(judgement)[:MOST_CONCERNS]]
-    return " ".join([*sentences, _advice(judgement, faulty)])
+    if frozen and judgement.monitor.note:
+        sentences.append(f"Then {judgement.monitor.note}.")
+    return " ".join([*sentences, _advice(judgement, lasting)])
+
+
+def _without_brief_sets(faulty: Sequence[Episode]) -> Sequence[Episode]:
+    """Return the episodes without sets that ended within `BRIEF`, unless they are all like that.
+
+    A brief set confirms no channel. Beside a declaration that lasts, it asks for nothing.
+    """
+    lasting = [
+        one
+        for one in faulty
+        if one.state != "AMBIGUOUS" or one.stands or one.end_s - one.since_s >= BRIEF
+    ]
+    return lasting or faulty
 
 
 def _advice(judgement: Judgement, faulty: Sequence[Episode]) -> str:
@@ -253,6 +273,11 @@ def _shakes(judgement: Judgement, units: Collection[str]) -> bool:
         one.name in noisy and (one.unit or one.name) in units
         for one in judgement.monitor.channels
     )
+
+
+def set_clocks(judgement: Judgement) -> list[Concern]:
+    """Return the concerns about clocks that were set. Every verdict lists them."""
+    return [one for one in judgement.concerns if one.trouble is Trouble.CLOCK]
 
 
 def noise_behind(judgement: Judgement) -> list[Concern]:

@@ -29,6 +29,7 @@ from fdi_ros.replay.verdict import (
     MOST_CONCERNS,
     SILENT_TO_END,
     noise_behind,
+    set_clocks,
     silent_units,
     unjudged_words,
     verdict_of,
@@ -75,7 +76,11 @@ def _concern_lines(summary: Summary) -> list[str]:
     """Return the concerns that the verdict does not list."""
     word = verdict_of(summary).word
     deciding = [one for one in summary.concerns if one.word.value == word]
-    said = [*deciding[:MOST_CONCERNS], *noise_behind(summary)[:MOST_CONCERNS]]
+    said = [
+        *deciding[:MOST_CONCERNS],
+        *noise_behind(summary)[:MOST_CONCERNS],
+        *([] if summary.scores.faults else set_clocks(summary)),
+    ]
     others = [one for one in _beside_silence(summary) if one not in said]
     return [one.sentence for one in others]
 

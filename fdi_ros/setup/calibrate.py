@@ -301,7 +301,8 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
                 for why, count in data.unusable.items()
             )
             raise CalibrationError(
-                f"{name} gives a usable value in {100 * share:.0f} % of its samples, expected at least {100 * LEAST_USABLE:.0f} %"
+                f"{name} gives a usable value in {100 * share:.0f} % of its samples, expected at least"
+                f" {100 * LEAST_USABLE:.0f} %"
                 f" ({lost}): mend it or name it in excluded_channels"
             )
 

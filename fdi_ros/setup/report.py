@@ -25,6 +25,7 @@ from fdi_ros.inspection.fitness import (
     bad_values,
     copy_words,
     frozen_words,
+    message_findings,
     topic_findings,
     unused_topics,
 )
@@ -235,7 +236,8 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
         words += " motors off"
         yield Finding(Role.UNKNOWN, "rest", words, error=common)
     elif share <= LEAST_SUPPORT:
-        words = f"noise_std is from the quietest {100 * share:.0f} % of the recording: a longer rest gives a better value"
+        words = f"noise_std is from the quietest {100 * share:.0f} % of the recording: a longer"
+        words += " rest gives a better value"
         yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=LEAST_SUPPORT)
     error = result.axis_errors
     rms = np.std(found.rate, axis=0) * unit.factor
@@ -531,6 +533,7 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
             headline="USABLE, BUT LOOK",
             advice=Trouble.LEFT_OUT.advice([topic]),
         )
+    yield from message_findings(found.chosen, LOOK)
     yield from bad_values(found.chosen, LOOK)
     yield from topic_findings(found.chosen, unit)
     tried = found.proof.before if found.kept else found.proof.after

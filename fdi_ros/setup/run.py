@@ -140,7 +140,8 @@ class Proof:
             return f"the new settings declare {times_words(new)}"
         # Smaller losses occur at the edge of a gap.
         if before.judged - after.judged > 0.02:
-            return f"the new settings judge {100 * after.judged:.0f} % of the samples instead of {100 * before.judged:.0f} %"
+            words = f"the new settings judge {100 * after.judged:.0f} % of the samples"
+            return f"{words} instead of {100 * before.judged:.0f} %"
         # One fewer is chance.
         if tried_before == tried and was - now > 1:
             return f"the new settings isolate {now} of {tried} biases instead of {was}"

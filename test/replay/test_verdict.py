@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bag.recordings import START, imu, write_mcap
+from bag.recordings import START, imu, imu_messages, write_mcap
 from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
@@ -345,6 +345,44 @@ def test_delays_in_the_table_and_in_the_notes_have_one_reference(fdi, tmp_path):
     late_ms = re.search(r"(-?[\d.]+) ms", row)
     assert late_ms is not None
     assert float(late_ms[1]) == pytest.approx(20.0, abs=2.0)
+
+
+@pytest.mark.parametrize(("faulty", "word"), [(False, "LOOK"), (True, "FAULTY")])
+@pytest.mark.parametrize(
+    ("log_too", "words"),
+    [
+        (
+            False,
+            r"the clocks of all units were set back by 4\.99 s during the recording",
+        ),
+        (True, r"the times of recording go back by 4\.99 s: a clock was set, and"),
+    ],
+)
+def test_the_first_line_says_that_clocks_were_set(
+    log_too, words, faulty, word, fdi, tmp_path
+):
+    """Messages have two times: of recording, which orders them, and the stamp inside."""
+    time = np.arange(0, 30, 0.01)
+    random = np.random.default_rng(3)
+    turn = 0.5 * np.clip(time - 6, 0, 1)[:, None] * np.sin(np.outer(time, (0.7, 1, 2)))
+    rates = [turn + random.normal(0, 0.003, turn.shape) for _ in range(3)]
+    if faulty:
+        rates[1][time > 22, 1] += 0.5
+    recorded = START + np.round(time * 1e9).astype(np.int64)
+    stamp = np.where(time > 15, recorded - 5 * 10**9, recorded)
+    topics = [f"/imu_{k}/data_raw" for k in range(3)]
+    messages = imu_messages(stamp, np.hstack(rates), topics)
+    if not log_too:
+        times = np.repeat(recorded, 3).tolist()
+        messages = [
+            (topic, at, data)
+            for at, (topic, _, data) in zip(times, messages, strict=True)
+        ]
+    bag = write_mcap(tmp_path / "bag.mcap", messages)
+    first = fdi("replay", bag).out.splitlines()[0]
+    assert re.match(rf"{word}: .*{words}", first, re.IGNORECASE), first
+    inspected = fdi("inspect", bag).out.splitlines()[0]
+    assert "go back by up to 4.99 s: a clock was set" in inspected
 
 
 # Deliveries and values

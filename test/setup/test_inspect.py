@@ -154,6 +154,26 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
     assert "1 stamp does not increase" in " ".join(text.split())
 
 
+def test_a_unit_that_repeats_its_stamps_is_worth_a_look(tmp_path, fdi):
+    """Of two messages with one stamp the second one is not used."""
+    _, z = flight(1000)
+    stamp = START + STEP * np.arange(len(z))
+    messages = imu_messages(stamp, z)
+    struck = [k for k, (topic, _, _) in enumerate(messages) if topic == TOPICS[1]][7::7]
+    for k in struck:
+        topic, at, _ = messages[k]
+        messages[k] = (topic, at, imu(at - STEP, tuple(z[k // 2, 3:])))
+    first = fdi("inspect", write_mcap(tmp_path / "bag.mcap", messages)).out
+    words, _, advice = first.splitlines()[0].partition(" What to do: ")
+    assert words.startswith(
+        f"READY, BUT LOOK: {TOPICS[1]} repeats old stamps in 14 % of its messages: these are"
+        " not used"
+    )
+    assert advice == (
+        f"check the driver of {TOPICS[1]}: every message needs the time of its measurement"
+    )
+
+
 @pytest.mark.parametrize("which", ["flight", "recording"])
 def test_the_config_for_a_real_recording_is_one_that_the_monitor_takes(
     which, request, tmp_path
@@ -200,7 +220,7 @@ def test_noise_in_motion_is_told_apart_from_that_at_rest_of_each_unit_and_writte
             report.segments.noise().moving, [0.05, 0.1, 0.05], rtol=0.1
         )
         assert report.segments.noise().share == pytest.approx(22 / 30, abs=0.04)
-    assert "not finite: x in 1 messages" in topics_text(reports, damage)
+    assert "not finite: x in 1 message" in topics_text(reports, damage)
     assert [report.not_finite.tolist() for report in reports] == [[1, 0, 0], [0, 0, 0]]
     assert recording_text(reports, tmp_path / "bag.mcap").startswith(
         "bag.mcap: 30.0 s from "
