@@ -219,7 +219,7 @@ def _faulty_sentences(
     sentences += [one.sentence for one in set_clocks(judgement)]
     sentences += [f"{one}." for one in noise_behind(judgement)[:MOST_CONCERNS]]
     if frozen and judgement.monitor.note:
-        sentences.append(f"Then {judgement.monitor.note}.")
+        sentences.append(f"At the end, {judgement.monitor.note}.")
     return " ".join([*sentences, _advice(judgement, lasting)])
 
 

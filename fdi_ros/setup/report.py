@@ -590,6 +590,18 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         yield Finding(
             warning, "declared", words, list(tried.declared), headline="DO NOT USE"
         )
+    elif found.kept and (stuck := proof.after.stuck):
+        # The settings before need not see it: what moves is their noise.
+        verb = "repeats" if len(stuck) == 1 else "repeat"
+        words = f"{listed(list(stuck))} {verb} one value while the others move, in {proof.source}"
+        yield Finding(
+            warning,
+            "stuck",
+            words,
+            list(stuck),
+            headline="DO NOT USE",
+            advice="check driver and bus, and record again",
+        )
     elif found.kept:
         written = "The file has the settings that were given"
         if found.chosen:

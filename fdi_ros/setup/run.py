@@ -22,6 +22,7 @@ import numpy as np
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config, parameter_file
 from fdi_ros.core.sources import source_of
+from fdi_ros.core.states import Reason
 from fdi_ros.errors import BagError, CalibrationError, DisagreementError, FdiError
 from fdi_ros.inspection.fitness import (
     candidates,
@@ -96,8 +97,12 @@ class Tried:
         self.declared: dict[
             str, float
         ] = {}  # channels declared, without a fault, and when first, s
+        self.stuck: dict[str, float] = {}
+        """Channels declared because they repeat one value in motion, and when first, s."""
         for event in self.baseline.declared if self.baseline is not None else ():
             self.declared.setdefault(event.channel, event.at_s)
+            if event.reason == Reason.STUCK.value:
+                self.stuck.setdefault(event.channel, event.at_s)
         # Biases isolated, and tried, of all sizes.
         self.isolated_of = tuple(
             map(sum, zip(*self.isolated.values(), strict=True))

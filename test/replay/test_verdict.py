@@ -31,6 +31,7 @@ from fdi_ros.monitor.soundness import (
 )
 from fdi_ros.replay.health import MOST_WINDOWS, Deliveries
 from fdi_ros.replay.run import replay
+from fdi_ros.replay.verdict import _without_brief_sets
 from fdi_ros.replay.words import sentences
 
 CASES = ROOT.parent / "shared" / "data" / "cases"
@@ -304,7 +305,9 @@ def oscillate(time, rates):
     [
         (
             freeze,
-            r"FAULTY: imu_1, all axes, from (15|16|17|18|19)\.\d s\. Reason: frozen: has repeated one",
+            r"FAULTY: imu_1, all axes, from (15|16|17|18|19)\.\d s\. Reason: frozen: has repeated one"
+            r" .* At the end, a fault of imu_0 or imu_2 would be seen, but not isolated\."
+            r" Do not fly before imu_1 is checked or replaced\.$",
         ),
         (
             lose_values,
@@ -322,6 +325,24 @@ def test_the_verdict_names_what_is_wrong_and_not_what_was_doubted(
 ):
     out = fdi("replay", three_units(tmp_path / "three.csv", strike)).out
     assert re.match(sentence, out.splitlines()[0]), out
+
+
+def test_a_brief_set_asks_for_nothing_beside_a_fault_that_lasts():
+    def episode(state, seconds, stands):
+        return SimpleNamespace(
+            state=state, since_s=5.0, end_s=5 + seconds, stands=stands
+        )
+
+    brief = episode("AMBIGUOUS", 0.02, False)
+    lasting = [
+        episode("FAULTY", 9.0, True),
+        episode("AMBIGUOUS", 0.5, True),
+        episode("AMBIGUOUS", 2.0, False),
+        episode("FAULTY", 0.1, False),
+    ]
+    for one in lasting:
+        assert _without_brief_sets([one, brief]) == [one]
+    assert _without_brief_sets([brief, brief]) == [brief, brief]
 
 
 def test_delays_in_the_table_and_in_the_notes_have_one_reference(fdi, tmp_path):

@@ -538,11 +538,10 @@ def test_a_unit_that_may_be_the_cause_is_advised_on_alone() -> None:
     )
 
 
-def test_settings_no_better_than_before_do_not_hide_that_no_test_fault_was_isolated() -> (
-    None
-):
+def not_better(stuck):
+    """New settings that are not kept, and the channels that they declare as stuck."""
     none = dict.fromkeys(SIZES, (0, 18))
-    found = SimpleNamespace(
+    return SimpleNamespace(
         disagree=None,
         calibration=object(),
         config=Config.from_file(ROOT / "config" / "two_imus.yaml"),
@@ -554,9 +553,23 @@ def test_settings_no_better_than_before_do_not_hide_that_no_test_fault_was_isola
             before=SimpleNamespace(
                 judged=1.0, declared={}, isolated=none, isolated_of=(0, 54)
             ),
+            after=SimpleNamespace(stuck=stuck),
         ),
     )
-    (proof,) = _worth(found, RADIANS)
+
+
+def test_a_channel_that_only_the_new_settings_see_stuck_forbids_their_use():
+    (found,) = _worth(not_better({"imu_1.y": 40.0}), RADIANS)
+    assert found.headline == "DO NOT USE"
+    assert found.words == (
+        "imu_1.y repeats one value while the others move, in the last 37 s"
+    )
+
+
+def test_settings_no_better_than_before_do_not_hide_that_no_test_fault_was_isolated() -> (
+    None
+):
+    (proof,) = _worth(not_better({}), RADIANS)
     assert proof.headline == "NO BETTER THAN BEFORE"
     assert proof.words.endswith(
         "Of 54 test faults added there (0.03 to 0.3 rad/s), none was isolated: a faulty"
