@@ -219,7 +219,7 @@ def test_contradictions_are_refused_and_named():
     refused(swapped, [6, 7, 8], z[:, [7, 8, 6]])
     noise = 0.01 + 0.0025 * np.random.default_rng(1).standard_normal(len(z))
     refused("imu_2", 5, noise, one.config)
-    off = r"imu_2.y disagrees with the others in \d\d% of the recording \(from \d+\.\d s\): faulty; repair it"
+    off = r"imu_2.y disagrees with the others in \d\d % of the recording \(from \d+\.\d s\): faulty; repair it"
     late = np.s_[len(z) // 4 :]
     refused(off, 4, z[late, 4] + 0.1, rows=late)
     for words, block in (
