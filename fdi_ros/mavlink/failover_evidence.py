@@ -15,7 +15,7 @@ were both taken out in this flight never outvote one that was not.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import NamedTuple
@@ -236,6 +236,20 @@ class Evidence:
         self._odd_seen = 0
         self._looked = 0
 
+    def remember(self, axes: Mapping[int, int | None]) -> None:
+        """Take the axis on which IMUs were off most before a restart, where it is known.
+
+        How they were off is not known any more: each counts as a gyro without scale.
+        """
+        for k, axis in axes.items():
+            if axis is not None:
+                self._tracks[k].wrong = Wrong(axis, 0.0, math.inf, 1.0)
+
+    def worst_axis(self, unit: int) -> int | None:
+        """Return the axis on which an IMU that is or was bad was off most, or None."""
+        wrong = self._tracks[unit].wrong
+        return None if wrong is None else wrong.axis
+
     def hear(self, states: Sequence[float], now: int) -> None:
         """Take the states of all channels, numbers of `ChannelState`, at time now, ns."""
         if now - self.heard >= SILENCE:
@@ -359,6 +373,10 @@ class Evidence:
             track = self._tracks[k]
             doubts = track.doubts
             if doubts != track.doubted:
+                if ChannelState.FAULTY in doubts - track.doubted:
+                    # Agreement from before says nothing of a gyro that died since then.
+                    track.refuted = track.turned = None
+                    track.has_shown = False
                 track.doubted = doubts
                 track.doubted_at = now
             own = [max(self._pairs[k, j].apart) for j in units if j != k]

@@ -178,6 +178,7 @@ class PolicyState(NamedTuple):
             # Reported out, as far as known: an order may still be under way.
             memories[k].ours = memories[k].held = True
             memories[k].seen = False
+            memories[k].taken = 1
             memories[k].without_notch = k in without_notch
         return cls(memories)
 

@@ -849,6 +849,57 @@ def test_a_fast_turn_about_another_axis_hides_no_error(
     assert talk.heal(2, 6.0).in_use == [True] * 3
 
 
+def restarted(talk: Monitored, path: Path) -> Monitored:
+    """Return the same flight with a companion that starts anew."""
+    talk.failover.close()
+    autopilot = talk.autopilots[0]
+    boot, start = autopilot.boot, autopilot.start
+    again = Monitored(path, autopilot)
+    again.now, autopilot.boot, autopilot.start = talk.now, boot, start
+    again.states = talk.states
+    return again
+
+
+@pytest.mark.parametrize("flies", [True, False])
+def test_a_restart_of_the_companion_forgets_no_axis(
+    tmp_path: Path, flies: bool
+) -> None:
+    """Two dead gyros that go back in a turn about another axis would outvote the third."""
+    talk, moved = moving(tmp_path, 0.4, 0.3, 0.1)
+    for imu in (1, 2):
+        moved.scale[imu - 1, 0] = 0.0
+        talk.fault(imu, 0.0, (FAULTY, OK, OK), seconds=1.0)
+    assert talk.in_use == [False, False, True]
+    moved.rate = np.array([0.01, 0.01, 0.02])
+    talk.run(1.0)
+    talk.autopilots[0].armed = flies
+    again = restarted(talk, tmp_path)
+    moved.rate = np.array([0.01, 0.01, 0.5])
+    again.heal(1)
+    again.heal(2, 8.0)
+    assert again.in_use == [False, False, True]
+    moved.rate = np.array([1.0, 0.01, 0.02])
+    assert again.run(3.0).in_use == [False, False, True]
+    moved.scale[:] = 1.0
+    assert again.run(8.0).in_use == [True] * 3
+
+
+def test_two_gyros_that_die_in_a_hover_do_not_outvote_the_third(
+    tmp_path: Path,
+) -> None:
+    """At rest a dead gyro agrees, also after the monitor has named it."""
+    talk, moved = moving(tmp_path, 0.3, 0.3, 0.2)
+    moved.rate = np.array([0.01, 0.01, 0.01])
+    talk.run(2.0)
+    for imu in (1, 2):
+        moved.scale[imu - 1] = 0.0
+        talk.fault(imu, 0.0, [FAULTY] * 3, seconds=1.0)
+    talk.run(4.0)
+    moved.rate = np.array([0.01, 0.01, 0.7])
+    assert talk.run(3.0).in_use[2]
+    assert ("INS_USE3", 0.0) not in {order[1:] for order in talk.autopilots[0].sets}
+
+
 @pytest.mark.parametrize("bad", [(2,), (2, 3)])
 def test_bad_imus_that_scatter_beside_one_at_rest_stay_out(
     tmp_path: Path, bad: tuple[int, ...]
@@ -1447,6 +1498,8 @@ def test_a_file_that_cannot_be_written_in_flight_is_announced_and_written_later(
     [
         "[]",
         '{"system_id": 1, "out_of_use": [4]}',
+        '{"system_id": 1, "out_of_use": [2], "worst_axes": ["w"]}',
+        '{"system_id": 1, "out_of_use": [2], "worst_axes": []}',
         '{"system_id": Infinity, "out_of_use": []}',
         '{"system_id": 1, "out_of_use": [Infinity]}',
         "[" * 4000,
