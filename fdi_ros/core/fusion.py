@@ -69,9 +69,9 @@ def fuse(core: Core, subsets: NDArray[Any], doubtful: int) -> None:
         )
         contradicted = find_contradicted(core, now, last)
         update_leapt(core, now, last, subsets, contradicted)
-        wrong = contradicted | doubtful & now.usable
-        add_alternatives(core, now, last, subsets, wrong)
-        add_unchecked(core, now, last, subsets, wrong)
+        candidates = contradicted | doubtful & now.usable
+        add_alternatives(core, now, last, subsets, candidates)
+        add_unchecked(core, now, last, subsets, candidates)
         add_jumps(core, now, last, subsets)
         if doubtful & now.usable:
             add_units(settings, now, last, subsets, doubtful & now.usable)
@@ -297,16 +297,18 @@ def add_unchecked(
         if not now.usable >> i & 1:
             continue
         rest = now.fused & ~(1 << i)
-        if subsets[rest].spans:
+        if not subsets[rest].spans:
+            if now.fused >> i & 1 and core.deviation[i] > 0.0:
+                error = max(core.deviation[i], abs(now.corrected[i]))
+                error = min(error, LARGEST_DIFFERENCE)
+                add_square(last.covariance, now.gain[:, i], error * error)
+        elif candidates >> i & 1:
             fill_rate(subsets[rest], core.settings.n, rest, now.corrected, now.doubt)
             others = along(core.settings.sensors.axes[i], now.doubt)
             deviation = abs(now.corrected[i] - others)
-            kept = max(core.deviation[i], deviation)
-            core.deviation[i] = kept if candidates >> i & 1 else 0.0
-        elif now.fused >> i & 1 and core.deviation[i] > 0.0:
-            error = max(core.deviation[i], abs(now.corrected[i]))
-            error = min(error, LARGEST_DIFFERENCE)
-            add_square(last.covariance, now.gain[:, i], error * error)
+            core.deviation[i] = max(core.deviation[i], deviation)
+        else:
+            core.deviation[i] = 0.0
 
 
 @compiled
