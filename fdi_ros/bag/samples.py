@@ -338,12 +338,20 @@ class Samples:
         return messages[keep]
 
 
-def _largest_step_back(last: Int, k: int, times: Int) -> int:
-    """Return the largest step back among further times (k,) of topic k, ns, and keep the last."""
+def steps_of(last: Int, k: int, times: Int) -> Int:
+    """Return the steps (N,) to further times (N,) of topic k, ns, and keep the last time.
+
+    ``last`` (topics,) are the last times so far, -1: none. The first step of a topic is 0.
+    """
     before = times[:1] if last[k] < 0 else last[k : k + 1]
     steps = np.diff(np.concatenate([before, times]))
     last[k] = times[-1]
-    return max(0, -int(steps.min()))
+    return steps
+
+
+def _largest_step_back(last: Int, k: int, times: Int) -> int:
+    """Return the largest step back among further times (N,) of topic k, ns."""
+    return max(0, -int(steps_of(last, k, times).min()))
 
 
 def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.raw import Batch
+from fdi_ros.bag.samples import steps_of
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.monitor.output import Output
@@ -106,14 +107,12 @@ class Deliveries:
 
     def _tap_intervals(self, k: int, times: Int) -> None:
         """Take the times of recording of further messages of topic k, ns."""
-        before = times[:1] if self._newest[k] < 0 else self._newest[k : k + 1]
-        steps = np.diff(np.concatenate([before, times])) * 1e-9
+        steps = steps_of(self._newest, k, times) * 1e-9
         steps = steps[steps > 0.0]
         bins = np.log(steps / SHORTEST_INTERVAL) / np.log(BIN_RATIO)
         bins = np.clip(bins, 0, INTERVAL_BINS - 1).astype(np.intp)
         np.add.at(self._intervals[k], bins, 1)
         np.add.at(self._lengths[k], bins, steps)
-        self._newest[k] = times[-1]
 
     def _steady_rate(self, k: int) -> float:
         """Return the rate of topic k by the interval that most of its messages have, Hz.

@@ -305,7 +305,8 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
         (one, [each for each in channels if each.unit == one.name] or list(channels))
         for one in units
     ]
-    delay = f"delay to {next((one.delay_to for one in units if one.delay_to), '')}"
+    reference = next((one.delay_to for one in units if one.delay_to), "")
+    delay = f"delay to {reference}" if reference else "delay"
     columns: dict[str, Callable[[Any], str]] = {
         "unit": lambda row: row[0].name,
         "delivered": lambda row: f"{100 * row[0].delivered:.0f} %",
