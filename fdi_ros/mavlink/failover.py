@@ -229,7 +229,7 @@ class Failover:
             after=clocks.uptime - ago,
             computer=clocks.boot,
             without_notch=self._without_notch,
-            axes=tuple(map(self.evidence.worst_axis, self.out)),
+            axes=tuple(map(self.evidence.bad_axes, self.out)),
         )
 
     def restore(self, now: int) -> tuple[bool, str]:
@@ -272,7 +272,7 @@ class Failover:
             return
         booted = newest.last - newest.time
         restarts = self._vehicle.clock.restarts
-        if self._booted is None and self.out:
+        if self._booted is None and (self.out or self._without_notch):
             if not self._is_same_boot((now - booted) / NS):
                 self._boots += 1
         elif self._booted is not None and booted - self._booted > BOOT_STEP:
@@ -407,7 +407,8 @@ class Failover:
             if condition is Condition.OUT:
                 self._unsized[key] = now
             else:
-                text = text_of(key, condition, self._channels)
+                waits = self.evidence.imus[key].waits if key >= 0 else ""
+                text = text_of(key, condition, self._channels, waits=waits)
                 texts.append((condition.value.severity, text))
         for imu, since in list(self._unsized.items()):
             error = self.evidence.error(imu, now)

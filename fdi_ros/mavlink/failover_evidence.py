@@ -82,6 +82,7 @@ KNOWN_SIGMAS = 5.0  #: Standard deviations from which a size is known.
 SILENCE = NS // 2  #: An IMU without samples for this time does not deliver, ns.
 STATES_KNOWN_FOR = 5 * NS  #: Older states of the monitor are unknown, ns.
 
+AXES = "xyz"
 NOBODY: tuple[int, set[int], int] = (-1, set(), 0)
 
 
@@ -96,14 +97,15 @@ class Compared(NamedTuple):
 
 
 class Wrong(NamedTuple):
-    """How an IMU was bad."""
+    """How one axis of an IMU was bad."""
 
-    axis: int  #: The axis that was off most.
-    size: float  #: By how much, rad/s.
     rate: float  #: Largest rate of the others about it then, rad/s.
     share: float  #: Largest ratio of error and rate: 1 for a gyro without scale.
 
 
+WITHOUT_SCALE = Wrong(
+    rate=math.inf, share=1.0
+)  #: A dead axis, or one of which no more is known.
 UNCOMPARED = Compared(*[UNKNOWN_RATES] * 4)
 
 
@@ -129,7 +131,11 @@ class Track:
     agreed_at: int = 0  #: When the IMU last agreed.
     #: The same, from a turn that shows an error in proportion to the rate.
     turned: int | None = None
-    wrong: Wrong | None = None  #: How the IMU was bad last.
+    wrong: dict[int, Wrong] = field(
+        default_factory=dict
+    )  #: How it was bad last, by axis.
+    #: Axes that have agreed in a turn that shows this, since the IMU agrees.
+    shown: set[int] = field(default_factory=set)
     #: Has agreed in a turn since the last time apart from all others.
     has_shown: bool = False
 
@@ -142,6 +148,11 @@ class Track:
     def doubts(self) -> set[ChannelState]:
         """Doubts that the monitor has now."""
         return DOUBTS.intersection(self.states)
+
+    @property
+    def waits(self) -> set[int]:
+        """Axes that were bad, and have not agreed in a turn that shows this."""
+        return self.wrong.keys() - self.shown
 
     def axes(self, *wanted: ChannelState) -> set[int]:
         """Return the axes to which the monitor gives a wanted state."""
@@ -236,19 +247,17 @@ class Evidence:
         self._odd_seen = 0
         self._looked = 0
 
-    def remember(self, axes: Mapping[int, int | None]) -> None:
-        """Take the axis on which IMUs were off most before a restart, where it is known.
+    def remember(self, axes: Mapping[int, str]) -> None:
+        """Take the axes on which IMUs were bad before a restart, such as xy.
 
-        How they were off is not known any more: each counts as a gyro without scale.
+        How they were bad is not known any more: each counts as without scale.
         """
-        for k, axis in axes.items():
-            if axis is not None:
-                self._tracks[k].wrong = Wrong(axis, 0.0, math.inf, 1.0)
+        for k, names in axes.items():
+            self._tracks[k].wrong = dict.fromkeys(map(AXES.index, names), WITHOUT_SCALE)
 
-    def worst_axis(self, unit: int) -> int | None:
-        """Return the axis on which an IMU that is or was bad was off most, or None."""
-        wrong = self._tracks[unit].wrong
-        return None if wrong is None else wrong.axis
+    def bad_axes(self, unit: int) -> str:
+        """Return the axes on which an IMU is or was bad, such as xy."""
+        return "".join(AXES[axis] for axis in sorted(self._tracks[unit].wrong))
 
     def hear(self, states: Sequence[float], now: int) -> None:
         """Take the states of all channels, numbers of `ChannelState`, at time now, ns."""
@@ -295,11 +304,12 @@ class Evidence:
             found = [self._pairs[k, j] for j in partners[k]]
             track.nearest = _nearest([pair.apart for pair in found])
             track.bound = max(_nearest([pair.bound for pair in found]))
-        held = math.exp(-(now - self._looked) / NS / DECAY)
+        elapsed = now - self._looked
+        held = math.exp(-elapsed / NS / DECAY)
         self._looked = now
         imus = []
         for k, track in enumerate(self._tracks):
-            agreed = self._note_agreement(k, partners[k], k in out, now)
+            agreed = self._note_agreement(k, partners[k], k in out, now, elapsed)
             _note_sizes(track, agreed, held, now)
             _note_names(track, agreed, now)
             faulty = track.axes(ChannelState.FAULTY)
@@ -308,9 +318,9 @@ class Evidence:
                 axes = axes - (track.outdated - self._axes_off_again(k, units, now))
             blamed = any(track.sizes[axis] >= self._min_size for axis in axes)
             if k in out or blamed:
-                self._note_wrong(track, partners[k])
+                self._note_wrong(track, partners[k], axes)
             elif agreed is not None and now - agreed >= HEALED:
-                track.wrong = None
+                track.wrong.clear()
             is_unknown = not track.states and k != odd
             stuck = self.raw.is_stuck(k)
             imus.append(
@@ -323,6 +333,7 @@ class Evidence:
                     size=max(track.sizes),
                     least=self._least(k, units),
                     agreed=agreed,
+                    waits="".join(AXES[axis] for axis in sorted(track.waits)),
                     judged=any(state not in UNJUDGED for state in track.states),
                 )
             )
@@ -377,6 +388,7 @@ class Evidence:
                     # Agreement from before says nothing of a gyro that died since then.
                     track.refuted = track.turned = None
                     track.has_shown = False
+                    track.shown.clear()
                 track.doubted = doubts
                 track.doubted_at = now
             own = [max(self._pairs[k, j].apart) for j in units if j != k]
@@ -392,31 +404,47 @@ class Evidence:
                 track.has_shown = False
 
     def _note_agreement(
-        self, unit: int, partners: Sequence[int], is_out: bool, now: int
+        self,
+        unit: int,
+        partners: Sequence[int],
+        is_out: bool,
+        now: int,
+        elapsed: int,
     ) -> int | None:
-        """Return since when an IMU agrees with another, ns, or None."""
+        """Return since when an IMU agrees with another, ns, or None.
+
+        elapsed: time since the last look, ns.
+        """
         track = self._tracks[unit]
         doubted = bool(track.doubts)
         # In a fast turn, what scales explain would hide the error of an IMU that was bad.
-        was_bad = is_out or track.wrong is not None
+        was_bad = is_out or bool(track.wrong)
         fit = [
             k
             for k in partners
             if not was_bad or max(self._pairs[unit, k].full) < self._min_size
         ]
         agreeing = [k for k in fit if self._agree(unit, k, doubted)]
-        is_contradicted = is_out and self._is_contradicted(unit, partners)
+        contradicted = self._contradicted(unit, partners) if is_out else set()
         if agreeing:
             track.agreed_at = now
-        if is_contradicted or now - track.agreed_at > BREAK:
+        if now - track.agreed_at > BREAK:
             track.agreed = track.turned = None
+            track.shown.clear()
+        elif contradicted:
+            # It, or the other one, is wrong: this time does not count, and a turn about
+            # these axes is needed once the two agree.
+            track.wrong = dict.fromkeys(contradicted, WITHOUT_SCALE) | track.wrong
+            track.shown -= contradicted
+            track.turned = track.turned and track.turned + elapsed
         elif agreeing:
             track.agreed = track.agreed or now
             # A mean that is no steady error yet may be the begin or end of a turn.
             alike = [k for k in agreeing if self._agree(unit, k, doubted=True)]
-            if any(self._shows(track.wrong, k) for k in alike):
+            if any(self._shows_all(track, k) for k in alike):
                 track.turned = track.turned or now
-        return track.turned if doubted or is_out else track.agreed
+        shown_since = None if track.waits else track.turned
+        return shown_since if doubted or is_out else track.agreed
 
     def _least(self, unit: int, units: Sequence[int]) -> float:
         """Return the difference of an IMU to the nearest of all others, rad/s."""
@@ -424,50 +452,61 @@ class Evidence:
         sizes = [max(self._pairs[pair].apart) for pair in pairs]
         return min((size for size in sizes if size >= 0.0), default=math.nan)
 
-    def _note_wrong(self, track: Track, partners: Sequence[int]) -> None:
-        """Note the axis on which a bad IMU is off most, and its error as a share."""
-        size, axis = max((size, axis) for axis, size in enumerate(track.nearest))
-        if not size >= self._min_size:
-            return
-        # A turn from before the error shows nothing.
-        track.turned = None
-        # Of a gyro without scale the error is this rate at most.
-        rate = max(self.raw.peaks(k)[axis] for k in partners)
-        share = size / max(rate, TINY)
-        before = track.wrong
-        if before is not None and axis == before.axis:
-            size = max(size, before.size)
-            rate = max(rate, before.rate)
-            share = max(share, before.share)
-        elif before is not None and size <= before.size:
-            return
-        track.wrong = Wrong(axis, size, rate, share)
+    def _note_wrong(
+        self, track: Track, partners: Sequence[int], named: set[int]
+    ) -> None:
+        """Note the axes on which a bad IMU is off or named, and its errors as shares.
 
-    def _shows(self, wrong: Wrong | None, other: int) -> bool:
-        """Return whether a turn of another IMU shows the error of one that agrees with it.
+        In a hover an axis that is named may be dead without being off. Of an IMU that is
+        out, and of which no axis is known, each axis may be.
+        """
+        off = {
+            axis for axis, size in enumerate(track.nearest) if size >= self._min_size
+        }
+        for axis in off:
+            # Of a gyro without scale the error is this rate at most.
+            rate = max(self.raw.peaks(k)[axis] for k in partners)
+            share = track.nearest[axis] / max(rate, TINY)
+            before = track.wrong.get(axis, Wrong(rate, share))
+            track.wrong[axis] = Wrong(max(rate, before.rate), max(share, before.share))
+        new = named - track.wrong.keys() or (set() if track.wrong else {0, 1, 2})
+        track.wrong |= dict.fromkeys(new, WITHOUT_SCALE)
+        if off or new:
+            # A turn from before the error shows nothing.
+            track.turned = None
+            track.shown.clear()
+
+    def _shows_all(self, track: Track, other: int) -> bool:
+        """Return whether an IMU that agrees with another has done so in turns that show its errors.
 
         A bias was apart at rest too. A gyro that has lost its scale on one axis shows that
         only in turns about this axis, and after any error a gyro may be dead.
         """
         turn = self.raw.turn(other)
-        if wrong is None:
+        if not track.wrong:
             return math.hypot(*turn) >= TURN_RATE
-        # What scatters does not agree from `CALM` on: twice that is shown by a shake.
-        shake = self.raw.shake(other)[wrong.axis] / (2.0 * CALM)
         dead = SHOWN * self._min_size
-        shown = max(abs(turn[wrong.axis]), dead * shake)
-        return shown >= max(dead, min(SAME_TURN * wrong.rate, dead / wrong.share))
+        # What scatters does not agree from `CALM` on: twice that is shown by a shake.
+        shakes = [dead * shake / (2.0 * CALM) for shake in self.raw.shake(other)]
+        for axis, wrong in track.wrong.items():
+            needed = max(dead, min(SAME_TURN * wrong.rate, dead / wrong.share))
+            if max(abs(turn[axis]), shakes[axis]) >= needed:
+                track.shown.add(axis)
+        return not track.waits
 
     def _partners(
         self, unit: int, units: Sequence[int], out: Sequence[int]
     ) -> list[int]:
         """Return the IMUs with which one is compared: in use or trusted, or else all.
 
-        One that is stuck is no measure.
+        One that is stuck is no measure. For one that is FAULTY, those are that the monitor
+        finds OK, if there are any: two that are FAULTY may be so alike.
         """
         others = [k for k in units if k != unit and not self.raw.is_stuck(k)]
         fit = [k for k in others if k not in out or self._is_trusted(k)]
-        return fit or others
+        fine = [k for k in fit if self._tracks[k].is_ok]
+        is_faulty = ChannelState.FAULTY in self._tracks[unit].states
+        return (is_faulty and fine) or fit or others
 
     def _is_trusted(self, unit: int) -> bool:
         return self._tracks[unit].refuted is not None
@@ -484,16 +523,18 @@ class Evidence:
         sizes = pair.bound if doubted else pair.apart
         return is_sound and not is_stuck and max(sizes) < self._min_size
 
-    def _is_contradicted(self, unit: int, partners: Sequence[int]) -> bool:
-        """Return whether an IMU differs from a partner that the monitor does not name.
+    def _contradicted(self, unit: int, partners: Sequence[int]) -> set[int]:
+        """Return the axes on which an IMU differs from a partner that the monitor does not name.
 
         Two IMUs that fail alike agree with each other, but not with the third.
         """
-        return any(
-            max(self._pairs[unit, k].apart) >= self._min_size
-            and not self._tracks[k].axes(ChannelState.FAULTY)
+        return {
+            axis
             for k in partners
-        )
+            if ChannelState.FAULTY not in self._tracks[k].states
+            for axis, size in enumerate(self._pairs[unit, k].apart)
+            if size >= self._min_size
+        }
 
     def _voters(self, unit: int, units: Sequence[int]) -> list[int]:
         """Return the two other IMUs, if they may outvote one, or none.
@@ -630,4 +671,4 @@ class Evidence:
             return None
         if not abs(mean[axis]) > KNOWN_SIGMAS * std[axis]:
             return None
-        return "xyz"[axis], mean[axis]
+        return AXES[axis], mean[axis]

@@ -24,7 +24,6 @@ LARGEST_FILE = 4096  #: Largest file that is read, bytes.
 RETRY = NS  #: Time between two attempts to write, ns.
 HANGING = 2 * NS  #: A write that takes longer is announced, ns.
 LONGEST_END = 5.0  #: Longest wait for a write at the end, s.
-PLACES = {"x": 0, "y": 1, "z": 2}  #: Places of the axes in a sample.
 UNANSWERED = "is not saved: the disk does not answer"
 
 
@@ -37,10 +36,9 @@ class Saved(NamedTuple):
     #: Time of the autopilot's start after that of this computer, s. NaN: unknown.
     after: float = math.nan
     computer: str = ""  #: Identity of that start of this computer. Empty: unknown.
-    #: IMUs out of use that were so when the autopilot started.
+    #: IMUs, out of use or not, that were out when the autopilot started.
     without_notch: tuple[int, ...] = ()
-    #: Axis on which each IMU of `out` was off most. None: unknown.
-    axes: tuple[int | None, ...] = ()
+    axes: tuple[str, ...] = ()  #: Axes on which each IMU of `out` was bad, such as xy.
 
     @property
     def lasting(self) -> tuple[object, ...]:
@@ -117,11 +115,10 @@ class FailoverFile:
             found = json.loads(read_trusted(self._path, LARGEST_FILE))
             out = tuple(int(imu) - 1 for imu in found["out_of_use"])
             bare = tuple(int(imu) - 1 for imu in found.get("without_notch", ()))
-            names = found.get("worst_axes", [None] * len(out))
-            axes = tuple(None if name is None else PLACES[name] for name in names)
-            if not set(out) <= set(range(count)) or not set(bare) <= set(out):
+            axes = tuple(map(str, found.get("bad_axes", ["xyz"] * len(out))))
+            if not {*out, *bare} <= set(range(count)):
                 raise ValueError
-            if len(axes) != len(out):
+            if len(axes) != len(out) or not set("".join(axes)) <= set("xyz"):
                 raise ValueError
             return Saved(
                 system=int(found["system_id"]),
@@ -156,7 +153,7 @@ class FailoverFile:
             "out_of_use": [imu + 1 for imu in saved.out],
             "autopilot_booted": round(saved.booted, 1),
             "without_notch": [imu + 1 for imu in saved.without_notch],
-            "worst_axes": [None if at is None else [*PLACES][at] for at in saved.axes],
+            "bad_axes": list(saved.axes),
         }
         if saved.computer:
             content["after_computer"] = round(saved.after, 1)

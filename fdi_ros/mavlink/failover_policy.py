@@ -30,10 +30,11 @@ Definitions
 Rules, in this order at each tick
     1. A held IMU goes back in use if the operator asks; if every other IMU is dead or out
        of use; or if the IMU has not been apart for a pause, counted from our order and from
-       a turn that would show its error: at rest a gyro that has lost its scale agrees too.
+       turns that would show its errors: at rest a gyro that has lost its scale agrees too.
        The pause is `FIRST_PAUSE`, doubled each time the IMU is taken out in one flight. In flight the
        last case needs a live monitor, and if all that are in use are bad, an IMU goes back
-       at once that the monitor finds OK, or soon if it is off by a `LESSER`-th. On the
+       at once that the monitor finds OK, or soon if it is off by a `LESSER`-th; of two IMUs
+       only one that is OK, and only after such a turn. On the
        ground the IMU stays out until the monitor finds it OK. An IMU that was out when the
        autopilot started has no notch filters: only the operator or rule 4 puts it back.
     2. In flight, the worst bad IMU to which `objection` has nothing becomes held. At
@@ -108,6 +109,8 @@ class Imu(NamedTuple):
     #: monitor doubts it, or it is out of use, from the time of a turn that would show its
     #: error.
     agreed: int | None = None
+    #: Axes, such as xz, that were bad and have not agreed in a turn that would show this.
+    waits: str = ""
 
 
 class View(NamedTuple):
@@ -179,7 +182,10 @@ class PolicyState(NamedTuple):
             memories[k].ours = memories[k].held = True
             memories[k].seen = False
             memories[k].taken = 1
-            memories[k].without_notch = k in without_notch
+        for k in without_notch:
+            memories[k].without_notch = True
+            # Not ours: reported in use since then.
+            memories[k].seen = k not in ours
         return cls(memories)
 
 
@@ -357,6 +363,7 @@ def _release(
         for memory, imu in pairs
     )
     only_bad = all(memory.ours or is_bad(imu, settings) for memory, imu in pairs)
+    is_pair = len(pairs) == 2
     in_use = [imu.size for memory, imu in pairs if not memory.ours]
     lesser = min(in_use, default=0.0) / LESSER
     for memory, imu in pairs:
@@ -365,9 +372,12 @@ def _release(
         agrees = has_stood(imu.agreed, pause, now) and not is_paused
         may = view.monitored if view.armed else imu.ok
         heals = agrees and may and is_alive(imu)
-        is_lesser = only_bad and imu.least < lesser
+        # Of two IMUs each is off from the other by the same.
+        is_lesser = only_bad and not is_pair and imu.least < lesser
         memory.lesser_since = (memory.lesser_since or now) if is_lesser else None
-        is_less = imu.ok or has_stood(memory.lesser_since, REACTION, now)
+        # Nor does the monitor know which one is wrong.
+        is_fine = imu.ok and not (is_pair and imu.waits)
+        is_less = is_fine or has_stood(memory.lesser_since, REACTION, now)
         is_better = only_bad and view.monitored and is_less and is_alive(imu)
         wanted = (heals or is_better) and not memory.without_notch
         if memory.held and (view.restore or none_left or wanted):

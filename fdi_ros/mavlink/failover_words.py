@@ -10,6 +10,7 @@ that holds. `announce` compares it with the last one announced:
    the last text about the same IMU or the vehicle.
 2. A repeated one is announced again every `REPEAT` while it lasts.
 3. While no condition holds, nothing is announced, and the last condition counts on.
+   `OUT` after `WAITS` is no news.
 4. At the start the last ones are `FINE` and `REDUNDANT`, so these two are announced only
    after another.
 5. Without a link nothing is announced, and what was announced into a gap of the link counts
@@ -37,11 +38,12 @@ from fdi_ros.mavlink.failover_policy import (
     is_apart,
     is_bad,
 )
-from fdi_ros.mavlink.failover_ready import MONITOR_LATE, NO_OTHER
+from fdi_ros.mavlink.failover_ready import INS_USE, MONITOR_LATE, NO_OTHER
 from fdi_ros.mavlink.protocol import MS, NS
 from fdi_ros.mavlink.report import CRITICAL, INFO, TEXT_LENGTH, WARNING
 
-UNNAMED = 5 * NS  #: An IMU that is apart, but not named, is announced after this, ns.
+#: An IMU that is apart, but not named, or that waits in flight, is announced after this, ns.
+UNNAMED = 5 * NS
 REPEAT = 10 * NS  #: Time between two announcements of a lasting danger, ns.
 SPACED = NS  #: Least time between two announcements that are not urgent, ns.
 SIZING = 200 * MS  #: Longest wait of a text for the size of an error, ns.
@@ -72,11 +74,11 @@ class Condition(Enum):
     # Of an IMU.
     DANGER = Words(CRITICAL, "faulty AND IN USE: land", urgent=True, repeated=True)
     STUCK_OUT = Words(WARNING, "not back in use, though asked")
-    REBOOT = Words(CRITICAL, "no notch: set INS_USE{} 1 and reboot")
+    REBOOT = Words(CRITICAL, "no notch: set {use} 1 and reboot")
     STAYS_OUT = Words(CRITICAL, "still faulty, stays out of use")
     FROZEN = Words(WARNING, "repeats one value, stays out")
     NOT_OK = Words(WARNING, "stays out, monitor does not find it OK")
-    UNTURNED = Words(WARNING, "stays out until turned by hand")
+    WAITS = Words(WARNING, "waits for a turn about {axes}")
     OUT = Words(CRITICAL, "out of use", urgent=True)
     LEFT_ALONE = Words(WARNING, "left alone in this flight")
     UNUSED = Words(WARNING, "not in use, not by failover")
@@ -98,6 +100,8 @@ class Note(NamedTuple):
 
     bad_since: int | None = None  #: Bad, in use and armed since this time.
     apart_since: int | None = None  #: In use, apart, and no `DANGER`, since this time.
+    #: Out by us, not apart, and without a turn that would show its error, since this time.
+    waits_since: int | None = None
     lane_angle: float = 0.0  #: Angle by which its EKF lane was misled, rad.
 
 
@@ -137,10 +141,11 @@ def announce(
     announced = dict(state.announced)
     words = []
     for key, condition in found.items():
-        if condition is None or not view.linked:
-            continue
         usual = Condition.REDUNDANT if key == VEHICLE else Condition.FINE
         last = announced.get(key, Announced(usual, LONG_AGO))
+        is_known = condition is Condition.OUT and last.condition is Condition.WAITS
+        if condition is None or is_known or not view.linked:
+            continue
         if condition is last.condition:
             is_due = condition.value.repeated and now - last.at >= REPEAT
         else:
@@ -176,7 +181,6 @@ def imu_condition(
     )
     # Not so where it agrees with one that is out of use: then that one has healed.
     is_alone = imu.least >= settings.min_size
-    is_near = imu.size < settings.min_size
     checks = (
         (has_stood(notes[k].bad_since, REACTION, now), Condition.DANGER),
         (asked_back, Condition.STUCK_OUT),
@@ -186,8 +190,9 @@ def imu_condition(
         (stays and imu.named is True, Condition.STAYS_OUT),
         (stays and imu.stuck, Condition.FROZEN),
         (stays and not imu.ok, Condition.NOT_OK),
-        (stays and imu.agreed is None, Condition.UNTURNED),
-        # It agrees, and goes back after its pause.
+        (stays and bool(imu.waits), Condition.WAITS),
+        (is_out and has_stood(notes[k].waits_since, UNNAMED, now), Condition.WAITS),
+        # It agrees, and goes back after its pause, or soon does.
         (stays, None),
         (is_out, Condition.OUT),
         (view.armed and memory.left_alone, Condition.LEFT_ALONE),
@@ -195,7 +200,7 @@ def imu_condition(
         # Where it agrees again, the one that it differed from was bad.
         (is_odd and imu.agreed is None and is_alone, Condition.APART),
         (_is_in_use(memory) and memory.without_notch, Condition.NO_NOTCH),
-        (_is_in_use(memory) and is_near, Condition.FINE),
+        (_is_in_use(memory) and imu.size < settings.min_size, Condition.FINE),
     )
     return next((condition for holds, condition in checks if holds), None)
 
@@ -263,6 +268,9 @@ def _note(
         is_off = is_apart(imu, settings) and not has_stood(bad_since, REACTION, now)
         apart_since = (note.apart_since or now) if in_use and is_off else None
         angle = 0.0 if is_anew else note.lane_angle
+        is_unshown = bool(imu.waits) and imu.size < settings.min_size
+        is_waiting = memory.ours and not in_use and is_unshown
+        waits_since = (note.waits_since or now) if is_waiting else None
         source = view.imus[k if in_use else first]
         # While two others are bad a healthy one, or one of a lesser error, is apart from both.
         is_bad_one = source.blamed or not (source.ok or source.named)
@@ -271,7 +279,7 @@ def _note(
             angle += source.size * seconds
         elif angle < LOST_LANE:
             angle *= max(0.0, 1.0 - seconds / LANE_RECOVERY)
-        notes.append(Note(bad_since, apart_since, angle))
+        notes.append(Note(bad_since, apart_since, waits_since, angle))
     return tuple(notes)
 
 
@@ -336,6 +344,7 @@ def text_of(
     condition: Condition,
     channels: Sequence[str],
     error: tuple[str, float] | None = None,
+    waits: str = "",
 ) -> str:
     """Return the text for an IMU, from 0, or `VEHICLE`.
 
@@ -346,12 +355,13 @@ def text_of(
     error
         Axis and size, rad/s, in REP-103 axes. The text has ArduPilot's: y to the right,
         z down.
+    waits
+        Axes about which a turn is needed.
     """
     words = condition.value.text
     if key == VEHICLE:
         return f"FDI: {words}"
-    # ArduPilot's parameters are INS_USE, INS_USE2, INS_USE3.
-    words = words.format(key + 1 if key else "")
+    words = words.format(use=INS_USE[key], axes=", ".join(waits))
     if error is not None:
         axis, size = error
         words += f" (gyro {axis} {size if axis == 'x' else -size:+.2f} rad/s)"

@@ -217,7 +217,7 @@ def test_a_gyro_that_is_stuck_does_not_agree_in_hover() -> None:
     watched.run(2.0)
     assert all(watched.step()[0].agreed is None for _ in range(100))
     watched.gyros[0] = sound
-    watched.rate = lambda t: np.array([0.2 * math.sin(5.0 * t), 0.0, 0.0])
+    watched.rate = lambda t: 0.2 * math.sin(5.0 * t) * np.ones(3)
     assert watched.run(2.0).step()[0].agreed is not None
 
 
@@ -493,8 +493,89 @@ def test_a_dead_gyro_with_noise_does_not_agree_in_a_quiet_hover() -> None:
     # One that has healed agrees once the vehicle turns, and at once if it is not doubted.
     watched.gyros[0] = sound
     assert watched.run(1.0).step()[0].agreed is None
-    watched.rate = lambda t: 0.2 * np.array([math.sin(2.1 * t), 1.0, 0.0])
+    watched.rate = lambda t: 0.2 * np.array([math.sin(2.1 * t), 1.0, 0.5])
     assert watched.run(1.0).step()[0].agreed is not None
+
+
+def spiked(watched: Watched, unit: int, axis: int, size: float) -> None:
+    """Let one axis of an IMU have an error for 0.4 s, in which it is named and taken out."""
+    watched.gyros[unit] = biased(size, axis)
+    watched.states[3 * unit + axis] = FAULTY
+    assert watched.blamed(0.4) == {unit}
+    watched.out = [*watched.out, unit]
+
+
+def hovering(t: float) -> np.ndarray:
+    """Return the rate of a vehicle that does not turn."""
+    return np.zeros(3)
+
+
+def turning_about(axis: int) -> Callable[[float], np.ndarray]:
+    """Return the rate of a vehicle that turns to and fro about one axis."""
+    return lambda t: 0.5 * math.sin(2.1 * t) * np.eye(3)[axis]
+
+
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_an_imu_agrees_only_after_a_turn_about_each_axis_that_was_bad(
+    is_seen: bool,
+) -> None:
+    """A spike on x, then y is dead: seen by less, or only named in a hover."""
+    watched = Watched()
+    spiked(watched, 0, axis=0, size=3.0)
+    watched.rate = turning_about(1) if is_seen else hovering
+    watched.gyros[0] = lambda rate: rate * np.array([1.0, 0.01, 1.0])
+    watched.states[1] = OK if is_seen else FAULTY
+    watched.run(2.0)
+    watched.rate = hovering
+    assert watched.run(1.0).step()[0].waits == "xy"
+    watched.rate = turning_about(0)
+    assert not any(watched.step()[0].agreed for _ in range(200))
+    assert watched.step()[0].waits == "y"
+    watched.gyros[0] = sound
+    watched.rate = turning_about(1)
+    imu = watched.run(2.0).step()[0]
+    assert imu.agreed is not None
+    assert not imu.waits
+
+
+def test_an_imu_that_is_out_without_a_known_axis_waits_for_turns_about_all() -> None:
+    watched = Watched()
+    watched.rate = turning_about(2)
+    watched.run(0.5).out = [0]
+    assert watched.run(2.0).step()[0].waits == "xy"
+
+
+def test_a_contradiction_of_an_unnamed_imu_suspends_the_time_of_agreement() -> None:
+    """The other one fails for half a second. A turn about its bad axis is needed after it."""
+    watched = Watched()
+    spiked(watched, 0, axis=0, size=3.0)
+    watched.gyros[0] = sound
+    watched.states[0] = OK
+    before = watched.run(4.0).step()[0]
+    begun = watched.now
+    watched.gyros[1] = biased(0.2, axis=1)
+    assert watched.blamed(0.5) == set()
+    during = watched.step()[0]
+    assert before.agreed is not None
+    assert (during.agreed, during.waits) == (None, "y")
+    watched.gyros[1] = sound
+    ended = watched.now
+    after = watched.run(2.0).step()[0]
+    assert after.agreed is not None
+    counted = watched.now - after.agreed
+    assert counted < watched.now - before.agreed - (ended - begun) + 200 * MS
+    assert counted > begun - before.agreed + NS
+
+
+def test_of_two_imus_that_fail_alike_each_differs_from_one_that_is_ok() -> None:
+    """Both in use and FAULTY agree with each other: both are apart from the third."""
+    watched = Watched()
+    watched.gyros[:2] = [lambda rate: rate * np.array([1.0, 0.01, 1.0])] * 2
+    watched.states[1] = watched.states[4] = FAULTY
+    assert watched.blamed(1.0) == {0, 1}
+    # A name that is remembered is no witness against one that agrees with the third.
+    watched.gyros[:2] = [sound] * 2
+    assert watched.run(1.0).blamed(1.0) == set()
 
 
 def test_a_noisy_gyro_at_rest_does_not_make_the_others_stuck() -> None:

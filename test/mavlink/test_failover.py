@@ -993,7 +993,7 @@ def test_after_landing_an_imu_stays_out_until_it_has_agreed_while_turning(
     autopilot.armed = False
     flying.heal(2, 20.0)
     assert flying.in_use == [True, False, True]
-    assert flying.texts[-1] == "IMU 2 stays out until turned by hand"
+    assert flying.texts[-1] == "IMU 2 waits for a turn about x, y, z"
     assert "out of use: IMU 2" in flying.failover.status(flying.now)[1]
     assert flying.failover.is_done, "nothing to wait for at a stop"
     autopilot.armed = True
@@ -1117,6 +1117,9 @@ def test_a_boot_without_notch_filters_is_not_hidden(
     assert "reboot before flight" in again.failover.status(again.now)[1]
     autopilot.parameters["INS_USE"] = 1.0
     assert again.run(5.0).texts[-1] == "IMU 1 no notch: reboot"
+    # Nor does the next start of the node forget it, though it is not out any more.
+    again = restarted(again, tmp_path).run(15.0)
+    assert again.failover.status(again.now)[1] == "no failover: reboot before flight"
     autopilot.reboot(again.now)
     assert again.run(12.0).failover.status(again.now)[1] == "ready"
 
@@ -1498,8 +1501,8 @@ def test_a_file_that_cannot_be_written_in_flight_is_announced_and_written_later(
     [
         "[]",
         '{"system_id": 1, "out_of_use": [4]}',
-        '{"system_id": 1, "out_of_use": [2], "worst_axes": ["w"]}',
-        '{"system_id": 1, "out_of_use": [2], "worst_axes": []}',
+        '{"system_id": 1, "out_of_use": [2], "bad_axes": ["w"]}',
+        '{"system_id": 1, "out_of_use": [2], "bad_axes": []}',
         '{"system_id": Infinity, "out_of_use": []}',
         '{"system_id": 1, "out_of_use": [Infinity]}',
         "[" * 4000,

@@ -110,3 +110,21 @@ def test_a_boot_begins_anew_with_orders_that_were_not_answered():
     assert not before.orders
     memory = on_the_ground(tired, now, use=True, boots=1).state.memories[0]
     assert (memory.ours, memory.held, memory.without_notch) == (False,) * 3
+
+
+@pytest.mark.parametrize(
+    ("count", "waits", "is_held"), [(2, "x", True), (2, "", False), (3, "x", False)]
+)
+def test_of_two_imus_one_goes_back_beside_a_bad_one_only_after_a_turn(
+    count, waits, is_held
+):
+    """The other one is named and off: by the dead one, which the monitor finds OK at rest."""
+    now = START + 10 * FIRST_PAUSE
+    bad = Imu(True, now, named=True, blamed=True, delivers=True, size=0.2, least=0.01)
+    out = Imu(False, now, delivers=True, ok=True, size=0.2, least=0.01, waits=waits)
+    state = PolicyState((OUT, *[Memory(seen=True)] * (count - 1)))
+    view = View((out, *[bad] * (count - 1)), linked=True, armed=True, monitored=True)
+    for k in range(200):
+        decision = decide(state, view, now + k * 20 * MS, PolicySettings())
+        state = decision.state
+        assert state.memories[0].held == is_held

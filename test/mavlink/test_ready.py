@@ -39,6 +39,16 @@ def test_all_good_is_ready_and_two_imus_are_not() -> None:
     assert reason(count=2) == "two IMUs: no third to decide"
 
 
+def test_two_that_were_bad_have_no_vote_on_the_third() -> None:
+    words = "two were bad: no vote"
+    for bad, why in ([0], ""), ([0, 1], words), ([0, 2], words), ([0, 1, 2], ""):
+        memories = [
+            Memory(seen=True, acquainted=True, taken=int(k in bad)) for k in range(3)
+        ]
+        view = View((GOOD,) * 3, linked=True, monitored=True)
+        assert not_ready(memories, view, FACTS, NOW, PolicySettings()) == why
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [

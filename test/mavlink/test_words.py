@@ -27,8 +27,10 @@ from fdi_ros.mavlink.failover_words import (
     WordsState,
     announce,
     imu_condition,
+    text_of,
     vehicle_condition,
 )
+from fdi_ros.mavlink.report import TEXT_LENGTH
 
 MS = 1_000_000
 NS = 1000 * MS
@@ -38,6 +40,7 @@ SETTINGS = PolicySettings()
 GOOD = Imu(use=True, heard=NOW, named=False, ok=True, delivers=True, size=0.0, agreed=1)
 BAD = GOOD._replace(named=True, blamed=True, ok=False, size=0.5, agreed=None)
 DOUBTED = GOOD._replace(ok=False)
+WAITING = GOOD._replace(agreed=None, waits="xz")
 APART = DOUBTED._replace(size=0.1, least=0.1, agreed=None)
 OUT = Memory(ours=True, held=True, seen=False, out_sent=LONG_AGO + 1, tries=1, taken=1)
 USED = Memory(seen=True)
@@ -68,7 +71,10 @@ def view(*imus: Imu, armed: bool = True, **given) -> View:
         (Condition.STAYS_OUT, OUT, BAD, Note(), False),
         (Condition.FROZEN, OUT, DOUBTED._replace(stuck=True), Note(), False),
         (Condition.NOT_OK, OUT, DOUBTED, Note(), False),
-        (Condition.UNTURNED, OUT, GOOD._replace(agreed=None), Note(), False),
+        (Condition.WAITS, OUT, WAITING, Note(), False),
+        (Condition.WAITS, OUT, WAITING, Note(waits_since=0), True),
+        # Not for long.
+        (Condition.OUT, OUT, WAITING, Note(waits_since=NOW - NS), True),
         (Condition.OUT, OUT, BAD, Note(), True),
         (Condition.LEFT_ALONE, Memory(seen=False, left_alone=True), BAD, Note(), True),
         (Condition.UNUSED, Memory(seen=False), BAD, Note(), True),
@@ -279,3 +285,20 @@ def test_what_is_announced_of_failover_itself(
     course: list[tuple[float, str, bool, bool]], texts: list[str]
 ) -> None:
     assert said(*course) == texts
+
+
+def test_a_healed_imu_waits_in_flight_for_a_turn_and_is_announced_out_once() -> None:
+    """The text comes after `UNNAMED`. If it is off again it is out as before: no news."""
+    state = WordsState((Note(),) * 3)
+    said = []
+    for k in range(300):
+        now = NOW + k * STEP
+        imu = WAITING if 50 <= k < 150 else WAITING._replace(size=0.5)
+        memories = (OUT, USED, USED)
+        state, found = announce(state, memories, view(imu), now, SETTINGS)
+        said += [(k, condition) for key, condition in found if key == 0]
+    assert said == [(0, Condition.OUT), (100, Condition.WAITS)]
+    text = text_of(0, Condition.WAITS, ["imu_1.x"] * 9, waits="xz")
+    assert text == "FDI: IMU 1 waits for a turn about x, z"
+    longest = text_of(2, Condition.WAITS, ["imu_3.x"] * 9, waits="xyz")
+    assert len(longest) <= TEXT_LENGTH
