@@ -245,7 +245,9 @@ class RawComparison:
 
     def shake(self, unit: int) -> Vector:
         """Return the standard deviation of the rate of an IMU within `AVERAGED`, rad/s."""
-        x, y, z = np.std(self._rates(unit), axis=0).tolist()
+        rates = self._rates(unit)
+        deviation = rates - _mean(rates)
+        x, y, z = np.sqrt(_mean(deviation * deviation)).tolist()
         return x, y, z
 
     def peaks(self, unit: int) -> Vector:
@@ -418,10 +420,11 @@ def _lasts(values: np.ndarray, window: np.ndarray) -> np.ndarray:
     parts = [values[window == k] for k in range(WINDOWS)]
     if min(map(len, parts)) < FEWEST:
         return np.zeros(values.shape[1], dtype=bool)
-    means = np.array([part.mean(axis=0) for part in parts])
-    stds = np.array([part.std(axis=0, ddof=1) for part in parts])
-    one_sign = np.abs(np.sign(means).sum(axis=0)) == WINDOWS
-    lasting: np.ndarray = one_sign & (np.abs(means) >= stds).all(axis=0)
+    means = np.array(list(map(_mean, parts)))
+    lasting: np.ndarray = np.abs(np.sign(means).sum(axis=0)) == WINDOWS
+    if lasting.any():
+        stds = np.array(list(map(_spread, parts, means)))
+        lasting &= (np.abs(means) >= stds).all(axis=0)
     return lasting
 
 
