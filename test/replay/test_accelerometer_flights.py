@@ -43,7 +43,7 @@ in_logs = pytest.mark.skipif(
 def test_every_fault_of_the_simulated_flight_is_named_or_held_in_a_set_and_none_wrong(
     position_std, least, missed
 ):
-    """Its units are at one place. If that is not known, 0.3 m/s^2 may pass for a shift of all biases."""
+    """Its units are at one place. If that is not known, the odds of 0.3 m/s^2 hardly fail to open a case."""
     rows = np.genfromtxt(SITL / "accel_faults.txt", dtype=str)
     faults = [
         (float(on) - BEGINS, float(off) - BEGINS, f"imu_{int(unit)}.accel_{axis}")
