@@ -443,8 +443,9 @@ class Evidence:
             alike = [k for k in agreeing if self._agree(unit, k, doubted=True)]
             if any(self._shows_all(track, k) for k in alike):
                 track.turned = track.turned or now
-        shown_since = None if track.waits else track.turned
-        return shown_since if doubted or is_out else track.agreed
+        if track.waits:
+            return None
+        return track.turned if doubted or is_out else track.agreed
 
     def _least(self, unit: int, units: Sequence[int]) -> float:
         """Return the difference of an IMU to the nearest of all others, rad/s."""

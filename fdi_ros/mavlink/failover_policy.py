@@ -33,12 +33,12 @@ Rules, in this order at each tick
        turns that would show its errors: at rest a gyro that has lost its scale agrees too.
        The pause is `FIRST_PAUSE`, doubled each time the IMU is taken out in one flight. In flight the
        last case needs a live monitor, and if all that are in use are bad, an IMU goes back
-       at once that the monitor finds OK, or soon if it is off by a `LESSER`-th; of two IMUs
-       only one that is OK, and only after such a turn. On the
+       at once that the monitor finds OK, or soon if it is off by a `LESSER`-th. On the
        ground the IMU stays out until the monitor finds it OK. An IMU that was out when the
        autopilot started has no notch filters: only the operator or rule 4 puts it back.
     2. In flight, the worst bad IMU to which `objection` has nothing becomes held. At
-       most ``limit`` IMUs are ours, without a limit all but one.
+       most ``limit`` IMUs are ours, without a limit all but one. Of two IMUs, one that has
+       not agreed in a turn since it was bad is no reserve.
     3. Orders are sent until the autopilot reports the wanted state. An order to take an
        IMU out is sent only while rule 2 holds, so also each repetition needs a sound
        other IMU whose "in use" was reported within `FRESH`.
@@ -106,8 +106,8 @@ class Imu(NamedTuple):
     least: float = float("nan")
     """Present one to the nearest of all others, out of use or not, rad/s. NaN: unknown."""
     #: Not apart from a sound IMU since this time. None: apart, stuck or unknown. If the
-    #: monitor doubts it, or it is out of use, from the time of a turn that would show its
-    #: error.
+    #: monitor doubts it, or it is out of use or was bad, from the time of turns that would
+    #: show its errors.
     agreed: int | None = None
     #: Axes, such as xz, that were bad and have not agreed in a turn that would show this.
     waits: str = ""
@@ -242,6 +242,9 @@ def objection(
         and now - view.imus[j].heard <= FRESH
         and not memories[j].ours
         and is_sound(view.imus[j], settings)
+        # Of two IMUs the monitor does not know which one is wrong. Both in use, the
+        # autopilot flies as without failover.
+        and (len(memories) > 2 or not view.imus[j].waits)
         for j in others
     )
     checks = (
@@ -363,7 +366,6 @@ def _release(
         for memory, imu in pairs
     )
     only_bad = all(memory.ours or is_bad(imu, settings) for memory, imu in pairs)
-    is_pair = len(pairs) == 2
     in_use = [imu.size for memory, imu in pairs if not memory.ours]
     lesser = min(in_use, default=0.0) / LESSER
     for memory, imu in pairs:
@@ -372,12 +374,9 @@ def _release(
         agrees = has_stood(imu.agreed, pause, now) and not is_paused
         may = view.monitored if view.armed else imu.ok
         heals = agrees and may and is_alive(imu)
-        # Of two IMUs each is off from the other by the same.
-        is_lesser = only_bad and not is_pair and imu.least < lesser
+        is_lesser = only_bad and imu.least < lesser
         memory.lesser_since = (memory.lesser_since or now) if is_lesser else None
-        # Nor does the monitor know which one is wrong.
-        is_fine = imu.ok and not (is_pair and imu.waits)
-        is_less = is_fine or has_stood(memory.lesser_since, REACTION, now)
+        is_less = imu.ok or has_stood(memory.lesser_since, REACTION, now)
         is_better = only_bad and view.monitored and is_less and is_alive(imu)
         wanted = (heals or is_better) and not memory.without_notch
         if memory.held and (view.restore or none_left or wanted):
