@@ -9,7 +9,8 @@ comparison does neither and shows the present difference of the autopilot's own 
 Two of three IMUs can be wrong alike: both stand still, or both are remembered as faulty. So
 they outvote the third only if they are trusted (`TRUSTED`), if their values change, and if
 the monitor has no doubt about them that it does not have about the third as well. Two that
-were both taken out in this flight never outvote one that was not.
+were both taken out in this flight outvote one that was not only once both are back, and have
+agreed in turns about all axes.
 """
 
 from __future__ import annotations
@@ -134,7 +135,8 @@ class Track:
     wrong: dict[int, Wrong] = field(
         default_factory=dict
     )  #: How it was bad last, by axis.
-    #: Axes that have agreed in a turn that shows this, since the IMU agrees.
+    #: Axes that have agreed in a turn that shows this, or that they are not dead, since the
+    #: IMU agrees.
     shown: set[int] = field(default_factory=set)
     #: Has agreed in a turn since the last time apart from all others.
     has_shown: bool = False
@@ -238,7 +240,8 @@ class Evidence:
         self._pairs: dict[tuple[int, int], Compared] = {}
         self._known_at: dict[tuple[int, int], int] = {}
         self._tracks = [Track() for _ in range(count)]
-        self._once_bad: set[int] = set()  # IMUs taken out in this flight
+        self._taken: set[int] = set()  # IMUs taken out in this flight
+        self._once_bad: set[int] = set()  # those of them without a vote
         self._min_size = min_size
         self._sized = max(2, SIZED // interval)
         self._together: int | None = None  # since when all IMUs agree, ns
@@ -292,7 +295,11 @@ class Evidence:
                 track.states = ()
         units = [k for k, does in enumerate(delivers) if does]
         self.raw.leave_out(out)
-        self._once_bad = {*out, *taken}
+        self._taken = {*out, *taken}
+        # One that is back regains its vote by turns about all axes: dead, it had not agreed.
+        self._once_bad = {
+            k for k in self._taken if k in out or len(self._tracks[k].shown) < 3
+        }
         self._compare(units, now)
         self._note_trust(units, now)
         odd, accused = self._lasting_odd_one(units, now)
@@ -333,6 +340,7 @@ class Evidence:
                     size=max(track.sizes),
                     least=self._least(k, units),
                     agreed=agreed,
+                    votes=k not in self._once_bad,
                     waits="".join(AXES[axis] for axis in sorted(track.waits)),
                     judged=any(state not in UNJUDGED for state in track.states),
                 )
@@ -443,7 +451,7 @@ class Evidence:
             alike = [k for k in agreeing if self._agree(unit, k, doubted=True)]
             if any(self._shows_all(track, k) for k in alike):
                 track.turned = track.turned or now
-        if track.waits:
+        if unit in self._taken and track.waits:
             return None
         return track.turned if doubted or is_out else track.agreed
 
@@ -484,16 +492,15 @@ class Evidence:
         only in turns about this axis, and after any error a gyro may be dead.
         """
         turn = self.raw.turn(other)
-        if not track.wrong:
-            return math.hypot(*turn) >= TURN_RATE
         dead = SHOWN * self._min_size
         # What scatters does not agree from `CALM` on: twice that is shown by a shake.
         shakes = [dead * shake / (2.0 * CALM) for shake in self.raw.shake(other)]
-        for axis, wrong in track.wrong.items():
+        for axis in range(3):
+            wrong = track.wrong.get(axis, WITHOUT_SCALE)
             needed = max(dead, min(SAME_TURN * wrong.rate, dead / wrong.share))
             if max(abs(turn[axis]), shakes[axis]) >= needed:
                 track.shown.add(axis)
-        return not track.waits
+        return not track.waits if track.wrong else math.hypot(*turn) >= TURN_RATE
 
     def _partners(
         self, unit: int, units: Sequence[int], out: Sequence[int]
@@ -540,7 +547,7 @@ class Evidence:
     def _voters(self, unit: int, units: Sequence[int]) -> list[int]:
         """Return the two other IMUs, if they may outvote one, or none.
 
-        Two that were bad in this flight may be bad alike again.
+        Two that were bad in this flight may be so, and alike, unless turns have shown more.
         """
         others = [k for k in units if k != unit]
         may = unit in self._once_bad or not self._once_bad.issuperset(others)

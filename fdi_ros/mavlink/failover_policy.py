@@ -106,11 +106,12 @@ class Imu(NamedTuple):
     least: float = float("nan")
     """Present one to the nearest of all others, out of use or not, rad/s. NaN: unknown."""
     #: Not apart from a sound IMU since this time. None: apart, stuck or unknown. If the
-    #: monitor doubts it, or it is out of use or was bad, from the time of turns that would
-    #: show its errors.
+    #: monitor doubts it, or it is out of use, or was in this flight, from the time of
+    #: turns that would show its errors.
     agreed: int | None = None
     #: Axes, such as xz, that were bad and have not agreed in a turn that would show this.
     waits: str = ""
+    votes: bool = True  #: Was not bad in this flight, or has agreed in turns about all axes since.
 
 
 class View(NamedTuple):

@@ -133,14 +133,13 @@ def _reasons(
             (not imu.lane, f"{EKF_LANES} is without {name}"),
         )
         yield from (words for holds, words in checks if holds)
-    once_bad = sum(bool(memory.taken) for memory in memories)
     orders = zip(INS_USE, facts.obeys, strict=False)
     yield from (ORDER_WORDS[obeys].format(name) for name, obeys in orders if not obeys)
     whole = (
         (not facts.has_lanes, f"{EKF_LANES} is not reported"),
         (not facts.is_file_fine, "failover_file is not usable"),
         (len(memories) < 3, "two IMUs: no third to decide"),
-        (len(memories) - once_bad == 1, "two were bad: no vote"),
+        (sum(imu.votes for imu in view.imus) == 1, "two were bad: no vote"),
     )
     yield from (words for holds, words in whole if holds)
     yield from filter(None, _objections(memories, view, now, settings))

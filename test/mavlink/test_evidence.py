@@ -179,12 +179,25 @@ def test_two_that_were_wrong_before_are_not_trusted_once_they_agree() -> None:
 def test_two_that_were_bad_in_this_flight_do_not_outvote_one_that_was_not(
     taken: list[int], blamed: set[int], state: int
 ) -> None:
+    """They do once they have agreed in turns about all axes."""
     watched = Watched()
+    moving = watched.rate
+    watched.rate = turning_about(0)
+    watched.run(0.5).out = taken
+    watched.run(0.5).out = []
     watched.taken = taken
+    assert watched.run(1.0).step()[0].votes == (0 not in taken)
     watched.gyros[2] = biased(0.7)
     watched.states[6] = state
     assert watched.blamed(3.0) == blamed
     watched.states[6] = FAULTY
+    assert watched.blamed(1.0) == {2}
+    watched.gyros[2] = sound
+    watched.states[6] = OK
+    watched.rate = moving
+    assert watched.run(4.0).step()[0].votes
+    watched.gyros[2] = biased(0.7)
+    watched.states[6] = state
     assert watched.blamed(1.0) == {2}
 
 

@@ -42,10 +42,9 @@ def test_all_good_is_ready_and_two_imus_are_not() -> None:
 def test_two_that_were_bad_have_no_vote_on_the_third() -> None:
     words = "two were bad: no vote"
     for bad, why in ([0], ""), ([0, 1], words), ([0, 2], words), ([0, 1, 2], ""):
-        memories = [
-            Memory(seen=True, acquainted=True, taken=int(k in bad)) for k in range(3)
-        ]
-        view = View((GOOD,) * 3, linked=True, monitored=True)
+        memories = [Memory(seen=True, acquainted=True)] * 3
+        imus = tuple(GOOD._replace(votes=k not in bad) for k in range(3))
+        view = View(imus, linked=True, monitored=True)
         assert not_ready(memories, view, FACTS, NOW, PolicySettings()) == why
 
 
