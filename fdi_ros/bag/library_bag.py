@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from fdi_ros.bag.raw import BagFile, Batch, Topic
+from fdi_ros.bag.recorder_clock import LEAST_SET_BACK, RecorderClock
 from fdi_ros.system.files import (
     PORTION_BYTES,
 )
@@ -29,7 +30,10 @@ class LibraryBag(BagFile):
 
     @abstractmethod
     def _messages(self, numbers: Sequence[int]) -> Iterator[Message]:
-        """Yield the messages of some topics in the order of recording, up to the first error."""
+        """Yield the messages of some topics in the order of recording, up to the first error.
+
+        If the clock of the recorder was set back, in the order of writing.
+        """
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
@@ -38,6 +42,7 @@ class LibraryBag(BagFile):
             for number, one in self._numbered.items()
             if one.name in topics
         }
+        clock = RecorderClock()
         whole = sum(self._numbered[number].count for number in chosen)
         read = 0
         found = self._messages(list(chosen)) if chosen else iter(())
@@ -45,13 +50,17 @@ class LibraryBag(BagFile):
             read += len(messages)
             numbers, times, data = zip(*messages, strict=True)
             length = np.array([len(one) for one in data])
+            topic = np.array([chosen[number] for number in numbers])
+            log_time = clock.follow(topic, np.array(times, dtype=np.int64))
+            self.state_set_back(clock)
+            disorder = LEAST_SET_BACK if clock.set_back else 0
             yield Batch(
                 buffer=np.frombuffer(b"".join(data), dtype=np.uint8),
-                topic=np.array([chosen[number] for number in numbers]),
-                log_time=np.array(times, dtype=np.int64),
+                topic=topic,
+                log_time=log_time,
                 offset=np.cumsum(length) - length,
                 length=length,
-                horizon=times[-1],
+                horizon=int(log_time[-1]) - disorder,
                 progress=min(1.0, read / max(1, whole)),
             )
 

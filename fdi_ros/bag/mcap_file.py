@@ -38,6 +38,7 @@ from fdi_ros.bag.raw import (
     starts_with,
     unpack_message,
 )
+from fdi_ros.bag.recorder_clock import LEAST_SET_BACK, RecorderClock
 from fdi_ros.bag.ros1_message import converted_from_ros1
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.messages import read_bits
@@ -200,6 +201,8 @@ class Piece(NamedTuple):
 
     #: ns
     start_time: int
+    #: ns
+    end_time: int
     offset: int
     #: bytes in the file
     size: int
@@ -226,6 +229,7 @@ class McapFile(BagFile):
         """Topics of gyros with messages of ROS 1."""
         self._found: list[Piece] = []
         self._scan()
+        steps_back = self._steps_back()
         self._found.sort(key=lambda piece: piece.start_time)
         self.start_time = self._found[0].start_time if self._found else NO_HORIZON
         ends = np.cumsum([min(piece.raw_size, CHUNK_BYTES) for piece in self._found])
@@ -233,6 +237,10 @@ class McapFile(BagFile):
         """In the order of time, those that unpack to no more than they may."""
         if len(self._pieces) < len(self._found):
             self.note(f"it unpacks to more than {most} bytes: read up to there")
+        self._follows_clock = not steps_back or self._clock_was_set()
+        """Whether pieces are read in the order of writing, in which a set clock shows."""
+        if steps_back and self._follows_clock:
+            self._pieces.sort(key=lambda piece: piece.offset)
         if not self._counts or not self._counts.keys() <= self._channels.keys():
             # Without a summary everything is read once: the topics stand inside the chunks alone.
             counts: Counter[int] = Counter()
@@ -247,6 +255,24 @@ class McapFile(BagFile):
             self._topic(number, one) for number, one in self._channels.items()
         )
 
+    def _steps_back(self) -> bool:
+        """Whether pieces that are written later begin before the end of earlier ones."""
+        latest = 0
+        for piece in self._found:
+            if piece.start_time <= latest - LEAST_SET_BACK:
+                return True
+            latest = max(latest, piece.end_time)
+        return False
+
+    def _clock_was_set(self) -> bool:
+        """Whether times step back in the file because the clock of the recorder was set."""
+        written = sorted(self._pieces, key=lambda piece: piece.offset)
+        found = [(one.topic, one.log_time) for one in map(self._messages, written)]
+        clock = RecorderClock()
+        if found:
+            clock.follow(*map(np.concatenate, zip(*found, strict=True)))
+        return clock.set_back > 0
+
     def _topic(self, number: int, channel: Channel) -> Topic:
         kind = ros_type(self._schemas.get(channel.schema_id, ""))
         encoding = channel.message_encoding.lower()
@@ -258,12 +284,14 @@ class McapFile(BagFile):
 
     def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
         """Read the messages of the topics."""
+        clock = RecorderClock()
         read = 0
         whole = sum(piece.size for piece in self._pieces)
         held = 0
         known = -1
         waiting: list[Batch] = []
-        following = [*(piece.start_time for piece in self._pieces[1:]), NO_HORIZON]
+        starts = [*(piece.start_time for piece in self._pieces[1:]), NO_HORIZON]
+        following = np.minimum.accumulate(starts[::-1])[::-1].tolist()
         for k, (piece, horizon) in enumerate(
             zip(self._pieces, following, strict=False), 1
         ):
@@ -283,11 +311,16 @@ class McapFile(BagFile):
                     number[channel.id] = (
                         topics.index(channel.topic) if channel.topic in topics else -1
                     )
-            batch = replace(
-                found, topic=number[found.topic], horizon=horizon, progress=read / whole
-            )
+            batch = replace(found, topic=number[found.topic], progress=read / whole)
             if not (batch.topic >= 0).all():
                 batch = batch.at(batch.topic >= 0)
+            log_time = batch.log_time
+            if self._follows_clock:
+                log_time = clock.follow(batch.topic, log_time)
+            self.state_set_back(clock)
+            if horizon != NO_HORIZON:
+                horizon += clock.least_shift
+            batch = replace(batch, log_time=log_time, horizon=horizon)
             yield from self._unpacked(batch, topics)
 
     def _unpacked(self, batch: Batch, topics: Sequence[str]) -> Iterator[Batch]:
@@ -382,7 +415,7 @@ class McapFile(BagFile):
     def _scan_chunk(self, offset: int, end: int) -> None:
         head = self._read(offset, _CHUNK.size + 16)
         if len(head) >= _CHUNK.size:
-            start_time, _, raw_size, crc, length = _CHUNK.unpack_from(head)
+            start_time, end_time, raw_size, crc, length = _CHUNK.unpack_from(head)
             compression = head[_CHUNK.size :][:length].decode("ascii", "replace")
             data = offset + _CHUNK.size + length + 8
             if length <= 16 and data <= min(end, self.size) and start_time < NO_HORIZON:
@@ -390,6 +423,7 @@ class McapFile(BagFile):
                 self._found.append(
                     Piece(
                         start_time,
+                        end_time,
                         data,
                         size,
                         raw_size,
@@ -410,9 +444,9 @@ class McapFile(BagFile):
             self._read(position, max(_RUN, end - position)), outside=True
         )
         if len(found):
-            self._found.append(
-                Piece(max(0, int(found.log_time.min())), position, stop, stop)
-            )
+            first = max(0, int(found.log_time.min()))
+            last = int(found.log_time.max())
+            self._found.append(Piece(first, last, position, stop, stop))
         for opcode, content in topics:
             self._describe(opcode, content)
         return position + max(stop, 1)

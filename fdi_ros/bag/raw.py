@@ -19,10 +19,11 @@ import zstandard
 from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_context import FlightContext
+from fdi_ros.bag.recorder_clock import RecorderClock
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Bytes, Int
 from fdi_ros.system.files import FILES, open_regular
-from fdi_ros.system.text import first_of, shown
+from fdi_ros.system.text import figures, first_of, shown
 from fdi_ros.system.yaml_file import read_yaml
 
 #: characters shown about one place
@@ -231,6 +232,14 @@ class BagFile(ABC):
     def state(self, fact: str) -> None:
         """Note a fact that readers must know."""
         self._damage.state(f"{self.path.name}: {fact}")
+
+    def state_set_back(self, clock: RecorderClock) -> None:
+        """Note that the clock of the recorder was set back."""
+        if clock.set_back:
+            self.state(
+                f"the clock of the recorder was set back by {figures(clock.set_back * 1e-9)} s:"
+                " the messages were taken in the order in which they were written"
+            )
 
     def leave_out(self, names: str, why: str) -> None:
         """Note gyros that cannot be read as such."""

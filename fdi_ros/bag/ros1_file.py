@@ -20,11 +20,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import lz4.frame
+import numpy as np
 from rosbags.rosbag1 import Reader, ReaderError
+from rosbags.rosbag1.reader import IndexData
 from rosbags.serde import SerdeError
 
 from fdi_ros.bag.library_bag import LibraryBag, Message
 from fdi_ros.bag.raw import Damage, Topic
+from fdi_ros.bag.recorder_clock import RecorderClock
 from fdi_ros.bag.ros1_message import converted_from_ros1
 from fdi_ros.errors import BagError
 from fdi_ros.system.files import (
@@ -58,6 +61,14 @@ class _Bounded(io.BufferedReader):
                 "its index, or a part of it, is larger than that of any recorder"
             )
         return super().read(size)
+
+
+class _Written(IndexData):
+    """An entry of an index, in the order in which messages were written."""
+
+    def __lt__(self, other: tuple[int, ...]) -> bool:
+        """Compare by place in the file."""
+        return self[1:] < other[1:]
 
 
 class Ros1File(LibraryBag):
@@ -101,12 +112,27 @@ class Ros1File(LibraryBag):
 
     def _messages(self, numbers: Sequence[int]) -> Iterator[Message]:
         try:
+            self._take_in_order_of_writing(numbers)
             connections = [one for one in self._reader.connections if one.id in numbers]
             for connection, time, data in self._reader.messages(connections):
                 message = converted_from_ros1(data, connection.msgtype)
                 yield connection.id, time, message
         except _ROS1_ERRORS as error:
             self.note(f"it is damaged ({error}): read up to there")
+
+    def _take_in_order_of_writing(self, numbers: Sequence[int]) -> None:
+        """Order the messages of topics by their places if the clock of the recorder was set back."""
+        indexes = self._reader.indexes
+        by_place = {
+            number: sorted(map(_Written._make, indexes[number])) for number in numbers
+        }
+        clock = RecorderClock()
+        for number, entries in by_place.items():
+            times = np.array([one.time for one in entries], dtype=np.int64)
+            clock.follow(np.full(len(times), number), times)
+        if clock.set_back:
+            for number, entries in by_place.items():
+                indexes[number] = list(entries)
 
     def _unpacked(self, unpacker: Callable[[], Any] | None, data: bytes) -> bytes:
         """Unpack a chunk."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.raw import NO_HORIZON, Batch
 from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.recorder_clock import RecorderClock
 from fdi_ros.config.config import Config
 from fdi_ros.core.alignment import Alignment, as_block
 from fdi_ros.core.sources import source_of
@@ -93,6 +94,7 @@ class Samples:
         self._waiting: Array | None = None
         """(m,) accelerations of an array that the next sample takes, m/s^2."""
         self._span = (start, end)
+        self._span_clock = RecorderClock()
         self._taps = taps
         self.period = period
         self._configured = config.sample_rate
@@ -112,11 +114,7 @@ class Samples:
             self.topics, 0
         )  #: malformed messages of each topic
         self.disordered = 0  #: messages without a stamp recorded before one that was handed on already: left out
-        self.recorded_back_s = 0.0
-        """Longest step back of the times of recording of a topic, in the order of the file, s."""
-        self._recorded = np.full(len(self.topics), -1, dtype=np.int64)
-        """Time of recording of the last message read of each topic, ns. -1: none."""
-        self._stamped = self._recorded.copy()
+        self._stamped = np.full(len(self.topics), -1, dtype=np.int64)
         """Stamp of the last message of each topic, ns. -1: none."""
         self._set_back = np.zeros(len(self.topics), dtype=np.int64)
         """Longest step back of the stamps of each topic, ns."""
@@ -137,8 +135,8 @@ class Samples:
                 self._note_newest(messages)
             for k in np.unique(messages["topic"]).tolist():
                 stamps = messages["stamp"][messages["topic"] == k]
-                step = _largest_step_back(self._stamped, k, stamps)
-                self._set_back[k] = max(self._set_back[k], step)
+                steps = steps_of(self._stamped, k, stamps)
+                self._set_back[k] = max(self._set_back[k], -steps.min())
             block = self._block(messages)
             self._check_rate(block.stamp)
             yield block
@@ -265,7 +263,6 @@ class Samples:
         waiting = np.empty(0, self._row)
         done = -1
         for batch in self.recording.batches(self.topics):
-            self._note_steps_back(batch)
             waiting = np.concatenate([waiting, self._decoded(batch)])
             if (np.diff(waiting["log_time"]) < 0).any():
                 waiting = waiting[np.argsort(waiting["log_time"], kind="stable")]
@@ -291,13 +288,6 @@ class Samples:
                 yield messages
         if len(waiting):
             yield waiting
-
-    def _note_steps_back(self, batch: Batch) -> None:
-        """Note by how much times of recording go back."""
-        for k in np.unique(batch.topic).tolist():
-            times = batch.log_time[batch.topic == k]
-            step = _largest_step_back(self._recorded, k, times)
-            self.recorded_back_s = max(self.recorded_back_s, 1e-9 * step)
 
     @property
     def set_back_s(self) -> float:
@@ -331,7 +321,9 @@ class Samples:
         if self.origin is None and keep.any():
             self.origin = int(stamp[np.argmax(keep)])
         if self._span != (0.0, math.inf):
-            seconds = (stamp - (self.origin or 0)) * 1e-9
+            # As the monitor counts them: they go on where all clocks were set back.
+            going_on = self._span_clock.follow(batch.topic, stamp)
+            seconds = (going_on - (self.origin or 0)) * 1e-9
             keep = keep & (seconds >= self._span[0]) & (seconds < self._span[1])
         for tap in self._taps:
             tap(batch, np.flatnonzero(keep))
@@ -347,11 +339,6 @@ def steps_of(last: Int, k: int, times: Int) -> Int:
     steps = np.diff(np.concatenate([before, times]))
     last[k] = times[-1]
     return steps
-
-
-def _largest_step_back(last: Int, k: int, times: Int) -> int:
-    """Return the largest step back among further times (N,) of topic k, ns."""
-    return max(0, -int(steps_of(last, k, times).min()))
 
 
 def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None:

@@ -21,8 +21,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fdi_ros.bag.library_bag import LibraryBag, Message
 from fdi_ros.bag.raw import NO_HORIZON, PACKED, Damage, Topic, unpack_message
+from fdi_ros.bag.recorder_clock import RecorderClock
 from fdi_ros.errors import BagError
 from fdi_ros.system.files import (
     CHUNK_BYTES,
@@ -184,7 +187,8 @@ class SqliteFile(LibraryBag):
         last = -1
         # A damaged database may have lost its index by time and keep the order of
         # writing.
-        for order in ("timestamp", "id"):
+        orders = ("id",) if self._clock_was_set(numbers) else ("timestamp", "id")
+        for order in orders:
             # Sorting happens in memory, so the query leaves out the messages
             # themselves.
             which = f"topic_id IN ({','.join('?' * len(numbers))}) AND timestamp > ? ORDER BY {order}"
@@ -210,6 +214,20 @@ class SqliteFile(LibraryBag):
                 if self._steps >= 0:
                     continue
             return
+
+    def _clock_was_set(self, numbers: Sequence[int]) -> bool:
+        """Whether times step back in the order of writing because the clock of the recorder was set."""
+        which = f"topic_id IN ({','.join('?' * len(numbers))}) ORDER BY id"
+        asked = f"SELECT topic_id, timestamp FROM messages WHERE {which}"
+        clock = RecorderClock()
+        try:
+            found = np.array(list(self._query(asked, numbers)))
+            if found.size and found.dtype == np.int64:
+                clock.follow(*np.ascontiguousarray(found.T))
+        except sqlite3.Error:
+            # Reading the messages tells what is damaged.
+            return False
+        return clock.set_back > 0
 
     def _message(self, row: int) -> Any:
         """Return a message as sent. A damaged one is empty, which counts as malformed."""

@@ -607,7 +607,6 @@ def _stream_result(samples: Samples, settings: Config, judge: Judge) -> StreamRe
         alignment=dict(zip(samples.topics, counters, strict=True)),
         damage=samples.recording.damage.losses(),
         set_back_s=samples.set_back_s,
-        recorded_back_s=samples.recorded_back_s,
         facts=tuple(samples.recording.damage.facts),
         unused=tuple(samples.recording.damage.left_out),
     )

@@ -29,8 +29,6 @@ from fdi_ros.system.text import figures
 if TYPE_CHECKING:
     import pandas
 
-LEAST_SET_BACK_S = 1.0
-"""Step back of times of recording that is reported, s. Queues disorder messages by less."""
 BRIEF = 1.0
 """A fault that stands for less is reported with its duration, s."""
 
@@ -150,29 +148,17 @@ class StreamResult:
     """Topics of gyros that were left out, and why."""
     set_back_s: float = 0.0
     """By how much the stamps of all units were set back together, s. 0: never."""
-    recorded_back_s: float = 0.0
-    """Longest step back of the times of recording of a topic, s."""
     facts: tuple[str, ...] = ()
     """What readers of the recording must know, and is no damage."""
 
     @property
     def clock_concerns(self) -> list[Concern]:
         """Reasons not to trust the times of the recording."""
-        found = []
-        if self.set_back_s > 0.0:
-            words = (
-                f"were set back by {figures(self.set_back_s)} s during the recording"
-            )
-            found.append(("the clocks of all units", words))
-        if self.recorded_back_s > LEAST_SET_BACK_S:
-            words = (
-                f"go back by {figures(self.recorded_back_s)} s: a clock was set, and messages of two"
-                " times are mixed, or the file is not in the order of time"
-            )
-            found.append(("the times of recording", words))
-        return [
-            Concern(Word.LOOK, Trouble.CLOCK, (who,), words) for who, words in found
-        ]
+        if not self.set_back_s:
+            return []
+        who = ("the clocks of all units",)
+        words = f"were set back by {figures(self.set_back_s)} s during the recording"
+        return [Concern(Word.LOOK, Trouble.CLOCK, who, words)]
 
 
 class ReplayVerdict(NamedTuple):

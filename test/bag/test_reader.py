@@ -23,6 +23,7 @@ from bag.recordings import (
     array,
     bounded,
     flight,
+    imu,
     write_bag,
     write_mcap,
     write_ros1,
@@ -408,3 +409,45 @@ def test_an_index_without_end_is_refused(tmp_path, monkeypatch):
         match="its index, or a part of it, is larger than that of any recorder",
     ):
         Recording(path)
+
+
+@pytest.mark.parametrize("make", ["zstd chunks", "rosbag2 sqlite3", "ros 1"])
+@pytest.mark.parametrize("all_clocks", [False, True])
+def test_messages_after_a_clock_was_set_back_follow_those_before(
+    make, all_clocks, tmp_path
+):
+    """Sorted by time, those of two times would be mixed, and equal stamps be lost."""
+    z = np.random.default_rng(0).normal(size=(SAMPLES, 6))
+    set_back = STAMP.copy()
+    set_back[SAMPLES // 2 :] -= 120 * STEP
+    stamps = set_back if all_clocks else STAMP
+    messages = [
+        (topic, at + 1000 * k, imu(stamp, row[3 * k : 3 * k + 3]))
+        for at, stamp, row in zip(set_back.tolist(), stamps.tolist(), z, strict=True)
+        for k, topic in enumerate(TOPICS)
+    ]
+    path = MAKES[make](tmp_path / "bag", messages)
+    stamp, values, samples = read(path)
+    # One value is lost where the samples begin anew.
+    there = np.isfinite(values)
+    assert (~there).sum() <= (3 if all_clocks else 0)
+    np.testing.assert_array_equal(values[there], z[there])
+    assert (np.diff(stamp) > 0).all()
+    (fact,) = samples.recording.damage.facts
+    assert "the clock of the recorder was set back by 1.19 s" in fact
+    # The time between the last message before the step and the first one after it is not known.
+    _, values, _ = read(path, start=1.0, end=2.0)
+    assert 100 <= len(values) <= 101
+    expected = np.where(np.isnan(values), values, z[100 : 100 + len(values)])
+    np.testing.assert_array_equal(values, expected)
+
+
+@pytest.mark.parametrize("make", ["zstd chunks", "rosbag2 sqlite3", "ros 1"])
+def test_parts_of_a_file_may_be_in_any_order(make, tmp_path):
+    messages, z = flight(SAMPLES)
+    late = messages[len(messages) // 2 :]
+    path = MAKES[make](tmp_path / "bag", late + messages[: -len(late)])
+    stamp, values, samples = read(path)
+    np.testing.assert_array_equal(stamp, STAMP)
+    np.testing.assert_array_equal(values, z)
+    assert samples.recording.damage.facts == []
