@@ -43,7 +43,7 @@ from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Bytes, Int
 from fdi_ros.system.files import EARLIEST, LATEST_TIME, LOG_SPAN
-from fdi_ros.system.text import figures, shown
+from fdi_ros.system.text import figures, percent, shown
 
 IMU = "sensor_msgs/msg/Imu"
 SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
@@ -248,8 +248,8 @@ class FlightLog(BagFile):
             while not self._survey():
                 pass
             if self.end < LEAST_READ * self.size:
-                share = 100 * (self.size - self.end) / self.size
-                rest = f"the last {share:.0f} % of {self.path.name}"
+                share = (self.size - self.end) / self.size
+                rest = f"the last {percent(share)} of {self.path.name}"
                 self.leave_out(rest, "the time steps back before it")
             self._sources = self._choose()
         except BaseException:  # Close the file whatever ends the opening.
@@ -455,7 +455,7 @@ class FlightLog(BagFile):
         """Leave out the rest of the file behind a byte."""
         self.note(
             f"the time steps back at byte {step}, as where a second log begins in the file: the {self.end - step}"
-            f" bytes behind it ({100 * (self.end - step) / self.end:.3g} % of the file) were left out"
+            f" bytes behind it ({percent((self.end - step) / self.end)} of the file) were left out"
         )
         self.end = step
 

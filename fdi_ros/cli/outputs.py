@@ -34,7 +34,7 @@ from fdi_ros.system.files import (
     whole,
     write_json,
 )
-from fdi_ros.system.text import LINE, shown, visible
+from fdi_ros.system.text import LINE, percent, shown, visible
 
 # Progress
 
@@ -95,7 +95,7 @@ def progress(
             share = done
             words = f"{spent:.0f} s so far"
             if share > 0:
-                words = f"{share:.0%} done after {spent:.0f} s"
+                words = f"{percent(share)} done after {spent:.0f} s"
             if said < share < 1.0:
                 # While one part takes long, nothing shows how long.
                 words += f", about {spent * (1 / share - 1):.0f} s left"

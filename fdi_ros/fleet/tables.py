@@ -39,7 +39,7 @@ from fdi_ros.report.layout import (
     told,
 )
 from fdi_ros.system.files import open_regular, plain, whole, write_text
-from fdi_ros.system.text import LINE, shown, storable
+from fdi_ros.system.text import LINE, percent, shown, storable
 
 Row = Mapping[str, Any]
 """Values of a row by the names of the columns. None: unknown."""
@@ -446,7 +446,7 @@ def columns_of(flights: Sequence[Row]) -> list[Column]:
         column(
             "unchecked",
             "not checked",
-            lambda shares: number(max(shares or (), default=None), ".0%"),
+            lambda shares: percent(max(shares or (), default=None)),
         ),
         column("episodes", "faults", lambda count: number(count, "d")),
         Column("declared", [row["declared"] for row in flights]),

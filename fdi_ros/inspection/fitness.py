@@ -32,7 +32,7 @@ from fdi_ros.monitor.diagnostics import DIAGNOSTICS
 from fdi_ros.monitor.output import OUTPUTS
 from fdi_ros.monitor.soundness import LEAST_DELIVERED, LEAST_SPIKES, Trouble
 from fdi_ros.report.layout import RADIANS, Unit
-from fdi_ros.system.text import LINE, figures, first_of, listed, shown
+from fdi_ros.system.text import LINE, figures, first_of, listed, percent, shown
 
 _OF_A_MONITOR = {
     topic.name.rpartition("/")[2]
@@ -356,7 +356,7 @@ def message_findings(
         if one.backward >= MANY_STAMPS * one.received:
             words = (
                 f"{shown(one.topic.name)} repeats old stamps in"
-                f" {figures(100 * one.backward / one.received, 2)} % of its messages: these are not used"
+                f" {percent(one.backward / one.received)} of its messages: these are not used"
             )
             yield _look("stamps", words, Trouble.STAMPS, (one.topic.name,), headline)
 
@@ -366,9 +366,9 @@ def _slow_topics(chosen: Sequence[TopicReport]) -> Iterator[tuple[str, str]]:
     times = [one.received * one.interval for one in chosen]
     for one, time in zip(chosen, times, strict=True):
         if time < LEAST_DELIVERED * max(times):
-            share = 100 * time / max(times)
+            share = time / max(times)
             name = one.topic.name
-            yield name, f"{shown(name)} delivered {share:.0f} % of its messages"
+            yield name, f"{shown(name)} delivered {percent(share)} of its messages"
 
 
 def bad_values(
@@ -398,7 +398,7 @@ def bad_values(
         names = [name for some in frozen.values() for name in some]
         share = max(float(one.repeats.count.max()) / one.received for one in chosen)
         verb = "repeats" if len(names) == 1 else "repeat"
-        words = f"{listed(names)} {verb} one value for long, in {100 * share:.0f} % of the messages"
+        words = f"{listed(names)} {verb} one value for long, in {percent(share)} of the messages"
         yield _look("frozen", words, Trouble.REPEATS, list(frozen), headline)
 
 
@@ -437,7 +437,7 @@ def frozen_words(chosen: Sequence[TopicReport]) -> str:
     share = max(shares[name] for name in frozen)
     verb = "repeats" if len(frozen) == 1 else "repeat"
     return (
-        f"{listed(frozen)} {verb} one value for long, in {100 * share:.0f} % of the messages, and the other"
+        f"{listed(frozen)} {verb} one value for long, in {percent(share)} of the messages, and the other"
         " units do not"
     )
 

@@ -50,7 +50,7 @@ from fdi_ros.inspection.turns import (
 )
 from fdi_ros.inspection.urdf import Urdf
 from fdi_ros.model.samples import Array
-from fdi_ros.system.text import figures, listed, shown
+from fdi_ros.system.text import figures, listed, percent, shown
 
 #: topics of flight logs, which keep the numbers of the autopilot
 _LOG_TOPIC = re.compile(r"/imu_[0-9]{1,3}")
@@ -321,7 +321,7 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
     noise = [report.segments.noise() for report in chosen]
     share = min(one.share for one in noise)
     levels = np.concatenate([one.moving for one in noise])
-    words = f"in motion ({100 * share:.0f} % of the recording), vibration included"
+    words = f"in motion ({percent(share)} of the recording), vibration included"
     if not (share > 0.5 and np.isfinite(levels).all() and (levels > 0).all()):
         quiet = np.concatenate([one.quiet for one in noise])
         usable = np.isfinite(quiet) & (quiet > 0)

@@ -34,7 +34,7 @@ from fdi_ros.report.layout import (
     told,
 )
 from fdi_ros.system.files import NAME
-from fdi_ros.system.text import date_of, figures, listed, shown
+from fdi_ros.system.text import date_of, figures, listed, percent, shown
 
 #: intervals longer than this many usual ones are gaps
 GAP_INTERVALS = 3.0
@@ -486,7 +486,7 @@ def _gyros(report: TopicReport, unit: Unit) -> str:
     )
     words += [report.copied] if report.copy_of else []
     words += (
-        [f"moving {100 * report.segments.noise().share:.0f} % of the time"]
+        [f"moving {percent(report.segments.noise().share)} of the time"]
         if report.complete
         else []
     )

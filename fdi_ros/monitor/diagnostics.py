@@ -19,7 +19,7 @@ from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.model.quantity import FORCE
 from fdi_ros.monitor.output import Topic
 from fdi_ros.monitor.soundness import Concern, Word, live_word
-from fdi_ros.system.text import figures, first_of, plus_minus, shown
+from fdi_ros.system.text import figures, first_of, percent, plus_minus, shown
 
 if TYPE_CHECKING:
     from fdi_ros.monitor.status import ChannelStatus, Status, UnitStatus
@@ -498,7 +498,7 @@ def _format_state(channel: ChannelStatus, status: Status) -> str:
     if channel.reason == Reason.DRIFTED and size:
         words = f"{words} ({size})"
     if channel.reason == Reason.INTERMITTENT:
-        words = f"{words}: delivers in {100 * channel.delivers:.0f} % of samples"
+        words = f"{words}: delivers in {percent(channel.delivers)} of samples"
     ending = {
         ChannelState.SUSPECT: "suspected, left out for now",
         ChannelState.FAULTY: "isolated and left out",

@@ -27,7 +27,7 @@ from fdi_ros.core.subsets import members
 from fdi_ros.model.quantity import FORCE, RATE
 from fdi_ros.model.samples import Array
 from fdi_ros.system import require
-from fdi_ros.system.text import date_of, figures, html_table
+from fdi_ros.system.text import date_of, figures, html_table, percent
 
 if TYPE_CHECKING:
     import pandas
@@ -228,7 +228,9 @@ class Output:
 
     def __repr__(self) -> str:
         seconds = (int(self.stamp[-1]) - int(self.stamp[0])) / 1e9 if len(self) else 0.0
-        rated = f", a rate in {100 * np.mean(self.valid):.0f} %" if len(self) else ""
+        rated = (
+            f", a rate in {percent(float(np.mean(self.valid)))}" if len(self) else ""
+        )
         size = f"{len(self)} samples of {len(self.channel_names)} channels, {seconds:.3f} s"
         return f"Output({size}{rated}; {len(self.events)} changes of state)"
 

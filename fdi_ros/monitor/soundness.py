@@ -21,7 +21,7 @@ from fdi_ros.config.unit_names import short_names
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.noise import much_noisier
 from fdi_ros.model.samples import Array
-from fdi_ros.system.text import LINE, figures, listed, shown
+from fdi_ros.system.text import LINE, figures, listed, percent, shown
 
 if TYPE_CHECKING:
     from fdi_ros.monitor.status import ChannelStatus, Status
@@ -337,7 +337,7 @@ def _is_slow(unit: UnitHealth) -> bool:
 
 
 def _slow_words(unit: UnitHealth) -> str:
-    words = f"delivered {100 * unit.delivered:.0f} % of its messages"
+    words = f"delivered {percent(unit.delivered)} of its messages"
     if unit.slow_rate_hz is None or unit.rate_hz is None:
         return words
     rates = f"{figures(unit.slow_rate_hz)} instead of {figures(unit.rate_hz)} Hz"
@@ -377,13 +377,13 @@ def _alike(
 
 def _unchecked(some: Sequence[ChannelHealth]) -> list[Concern]:
     least = min((one.checked for one in some), default=0.0)
-    words = f"could be checked in only {100 * least:.0f} % of the samples"
+    words = f"could be checked in only {percent(least)} of the samples"
     return _alike(some, Word.CANNOT_TELL, Trouble.UNCHECKED, words)
 
 
 def _incomplete(some: Sequence[ChannelHealth]) -> list[Concern]:
     least = min((one.delivered for one in some), default=0.0)
-    words = f"gave a value in only {100 * least:.0f} % of the samples"
+    words = f"gave a value in only {percent(least)} of the samples"
     return _alike(some, Word.LOOK, Trouble.DELIVERY, words)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.report.layout import FORCES, RADIANS, Unit
-from fdi_ros.system.text import figures, plus_minus
+from fdi_ros.system.text import figures, percent, plus_minus
 
 STRETCH_GAP = 10.0
 """Gap between two stretches, s. A shorter hole is within a stretch: messages were lost."""
@@ -560,7 +560,7 @@ def _rate(one: Episode, unit: Unit) -> str:
     share = (
         "published throughout"
         if rate.published == 1.0
-        else f"published in {figures(100 * rate.published)} % of samples"
+        else f"published in {percent(rate.published)} of samples"
     )
     words = [share]
     if rate.std_rad_s is not None:
@@ -587,7 +587,7 @@ def stretch_words(story: Story) -> list[str]:
     lines = []
     for number, one in enumerate(story.stretches, 1):
         own = sum(episode.stretch == number for episode in story.declared)
-        share = f"{figures(100 * one.judged / max(1, one.samples))} % judged"
+        share = f"{percent(one.judged / max(1, one.samples))} judged"
         count = f"{own} episode{'s' if own != 1 else ''}" if own else "nothing declared"
         lines.append(
             f"stretch {number}: {one.start_s:.3f} s to {one.end_s:.3f} s, {share}, {count}"

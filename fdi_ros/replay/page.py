@@ -58,7 +58,7 @@ from fdi_ros.report.layout import (
 )
 from fdi_ros.report.spectrum import Spectrum
 from fdi_ros.system import there
-from fdi_ros.system.text import date_of, figures
+from fdi_ros.system.text import date_of, figures, percent
 
 SEES_AXIS = 0.3
 """Smallest component of a channel's axis along a body axis for its curve to be drawn there."""
@@ -535,7 +535,7 @@ def _channel_section(summary: Summary, unit: Unit) -> Section:
             "the start" if one.since_s is None else f"{one.since_s:.3f} s"
         ),
         "reason": lambda one: one.reason or "-",
-        "not checked": lambda one: f"{one.unchecked:.1%}",
+        "not checked": lambda one: percent(one.unchecked),
         f"residual, {unit.name} rms": lambda one: figure(
             one, one.residual_rms_rad_s, ".2g"
         ),

@@ -27,6 +27,7 @@ from fdi_ros.report.layout import (
     page,
     section_text,
 )
+from fdi_ros.system.text import percent
 
 WANTED = 0.95
 """Share of the faults of a size that must be found for the size to count as found."""
@@ -259,7 +260,7 @@ MOVES = 0.1
 def smallest_hint(plan: Plan) -> str:
     """Explain the smallest sizes and the figures in brackets."""
     return (
-        f"From this size on, at least {WANTED:.0%} of the faults were detected (or isolated) within"
+        f"From this size on, at least {percent(WANTED)} of the faults were detected (or isolated) within"
         f" {plan.within:g} s. In brackets: how many of those tried, and the 95 % interval of the share."
     )
 
@@ -269,16 +270,16 @@ def figures_section(tried: Subject, plan: Plan) -> Section:
     columns: Columns = {
         "fault": lambda line: line.swept.words,
         "faults": lambda line: str(line.trials),
-        "isolated": lambda line: number(line.isolated.value, ".0%"),
+        "isolated": lambda line: percent(line.isolated.value),
         "95 % interval": lambda line: (
-            f"{line.isolated.low:.0%} to {line.isolated.high:.0%}"
+            f"{percent(line.isolated.low)} to {percent(line.isolated.high)}"
             if line.trials
             else "-"
         ),
-        "detected": lambda line: number(line.detected.value, ".0%"),
+        "detected": lambda line: percent(line.detected.value),
         "false": lambda line: str(line.false) if line.trials else "-",
-        "missed": lambda line: number(
-            share(line.counts[OutcomeKind.MISSED], line.trials).value, ".0%"
+        "missed": lambda line: percent(
+            share(line.counts[OutcomeKind.MISSED], line.trials).value
         ),
         "median delay": lambda line: number(line.found_after.median, ".2f", " s"),
         "95 %": lambda line: number(line.found_after.p95, ".2f", " s"),
@@ -295,7 +296,7 @@ def sound_lines(tried: Subject) -> list[str]:
         return [f"not tried: {tried.refused}"]
     words = f"nothing was declared in {baseline.duration:.1f} s"
     lines = [
-        f"{words} ({baseline.judged:.0%} of the samples judged, from {baseline.begins:.1f} s on)"
+        f"{words} ({percent(baseline.judged)} of the samples judged, from {baseline.begins:.1f} s on)"
     ]
     if told := baseline.judgement.story.declared:
         more = (
@@ -335,7 +336,7 @@ def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
             f"{family}: detected {_from(own, named=False)}; isolated {_from(own, named=True)}"
         )
     for line in [line for line in lines if line.swept.size is None]:
-        shares = f"detected in {line.detected.value:.0%}; isolated in {line.isolated.value:.0%}"
+        shares = f"detected in {percent(line.detected.value)}; isolated in {percent(line.isolated.value)}"
         words.append(f"{line.swept.words}: {shares}")
     false = sum(line.false for line in lines)
     words.append(
@@ -357,7 +358,7 @@ def _from(lines: Sequence[Line], named: bool) -> str:
     count = line.count(named)
     size = f"{line.swept.size:g} {line.swept.unit}".rstrip()
     interval = share(count, line.trials)
-    of = f"({count} of {line.trials}, {interval.low:.0%} to {interval.high:.0%})"
+    of = f"({count} of {line.trials}, {percent(interval.low)} to {percent(interval.high)})"
     return (
         f"from {size} {of}"
         if found
@@ -369,7 +370,8 @@ SHORT_HINT = "isolated / detected, median delay until detected; ! and a number: 
 
 
 def _in_short(line: Line) -> str:
-    words = f"{line.isolated.value:.0%} / {line.detected.value:.0%}, {number(line.found_after[0], '.2f', ' s')}"
+    shares = f"{percent(line.isolated.value)} / {percent(line.detected.value)}"
+    words = f"{shares}, {number(line.found_after[0], '.2f', ' s')}"
     return f"{words} !{line.false}" if line.false else words
 
 

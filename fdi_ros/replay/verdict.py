@@ -26,7 +26,7 @@ from fdi_ros.replay.episodes import (
 )
 from fdi_ros.replay.summary import BRIEF, Judgement, ReplayVerdict
 from fdi_ros.report.layout import RADIANS, Unit
-from fdi_ros.system.text import figures, first_of, listed
+from fdi_ros.system.text import figures, first_of, listed, percent
 
 LEAST_JUDGED = 0.5
 """Share of the samples that must be judged for a verdict."""
@@ -115,7 +115,7 @@ def unjudged_words(judgement: Judgement) -> str:
         return f"{words} (start-up bias: {bias.state})"
     share = scores.samples_judged / scores.samples
     if share < LEAST_JUDGED:
-        return f"only {100 * share:.1f} % of {scores.samples} samples were judged"
+        return f"only {percent(share)} of {scores.samples} samples were judged"
     if bias.far:
         return (
             f"the bias of {listed(bias.far)} was far larger than bias.turn_on_std from the"
@@ -176,7 +176,7 @@ def _healthy_words(judgement: Judgement) -> str:
     share = (
         "all checked"
         if checked > 0.995
-        else f"each checked in {100 * checked:.0f} % of the samples or more"
+        else f"each checked in {percent(checked)} of the samples or more"
     )
     end = [
         one.name

@@ -46,7 +46,7 @@ from fdi_ros.report.layout import (
     number,
     section_text,
 )
-from fdi_ros.system.text import figures, first_of, listed, shown, span
+from fdi_ros.system.text import figures, first_of, listed, percent, shown, span
 
 AUTOPILOT_LOGS = (".bin", ".tlog")
 """Suffixes of the logs of ArduPilot."""
@@ -309,9 +309,9 @@ def health_section(summary: Summary, unit: Unit = RADIANS) -> Section:
     delay = f"delay to {reference}" if reference else "delay"
     columns: dict[str, Callable[[Any], str]] = {
         "unit": lambda row: row[0].name,
-        "delivered": lambda row: f"{100 * row[0].delivered:.0f} %",
+        "delivered": lambda row: percent(row[0].delivered),
         "messages per s": lambda row: number(row[0].rate_hz, ".3g"),
-        "checked": lambda row: f"{100 * min(one.checked for one in row[1]):.0f} %",
+        "checked": lambda row: percent(min(one.checked for one in row[1])),
         "spikes": lambda row: str(sum(one.spikes for one in row[1])),
         "at end of range": lambda row: (
             f"{figures(max(one.saturated_s for one in row[1]), 2)} s"

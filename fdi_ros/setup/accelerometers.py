@@ -42,7 +42,7 @@ from fdi_ros.setup.estimate import (
 )
 from fdi_ros.setup.noise import projector
 from fdi_ros.setup.positions import delays_of, turning_of
-from fdi_ros.system.text import figures
+from fdi_ros.system.text import figures, percent
 
 #: Smallest share of usable samples of an accelerometer, relative to the median of all
 #: (counted as at least this share, too).
@@ -178,7 +178,7 @@ def _check_amount(data: Data, names: Sequence[str]) -> None:
     usual = float(np.median(share))
     if (least := float(share.min())) < LEAST_USABLE * max(usual, LEAST_USABLE):
         raise CalibrationError(
-            f"{names[int(share.argmin())]} gives a usable value in {100 * least:.0f} % of the samples"
+            f"{names[int(share.argmin())]} gives a usable value in {percent(least)} of the samples"
         )
 
 

@@ -34,7 +34,7 @@ from fdi_ros.inspection.turns import (
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.setup.blocks import Data
-from fdi_ros.system.text import figures
+from fdi_ros.system.text import figures, percent
 
 #: smallest response of a channel to the rotation of others, and the reverse
 LEAST_RESPONSE = 0.3
@@ -169,7 +169,7 @@ def _other_axes(turns: _Turns, nominal: Geometry, odd: int, most: Int) -> str:
     if max(shares) < SAME:
         return (
             f"{turns.names[odd]} does not measure the rotation of {_joined(turns, most)}"
-            f" ({100 * max(*shares, 0.0):.0f} % shared): its mount in the config is wrong, it is not"
+            f" ({percent(max(*shares, 0.0))} shared): its mount in the config is wrong, it is not"
             f" on the same body, or its clock is off by seconds{doubt}"
         )
     return (
@@ -231,7 +231,7 @@ def _check_response(moving: Array, nominal: Geometry) -> None:
             continue
         response, seen = np.median(found, axis=0).tolist()
         shows = (
-            f"{100 * response:.0f} % of"
+            f"{percent(response)} of"
             if abs(response) < 1
             else f"{figures(response)} times"
         )
@@ -359,7 +359,7 @@ def _against(first: Array, unit: Array) -> Mount:
         )
     # Most of the rotation then differs.
     if shared < 0.5:
-        words = f"NOT KNOWN: it does not measure the rotation of the first unit ({100 * max(shared, 0.0):.0f} % shared)"
+        words = f"NOT KNOWN: it does not measure the rotation of the first unit ({percent(max(shared, 0.0))} shared)"
         return Mount(words, shared, contradicts=True)
     if error > LARGEST_ERROR:
         words = f"it turns too little about a second axis ({figures(most, 2)} and {figures(second, 2)} rad/s rms)"

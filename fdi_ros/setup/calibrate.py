@@ -64,6 +64,7 @@ from fdi_ros.setup.estimate import (
     estimate,
 )
 from fdi_ros.setup.positions import Position, find_positions, position_settings
+from fdi_ros.system.text import percent
 
 #: of each component of an axis that may point anywhere: the root of a third
 UNKNOWN_MOUNT = 0.58
@@ -301,8 +302,8 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
                 for why, count in data.unusable.items()
             )
             raise CalibrationError(
-                f"{name} gives a usable value in {100 * share:.0f} % of its samples, expected at least"
-                f" {100 * LEAST_USABLE:.0f} %"
+                f"{name} gives a usable value in {percent(share)} of its samples, expected at least"
+                f" {percent(LEAST_USABLE)}"
                 f" ({lost}): mend it or name it in excluded_channels"
             )
 
@@ -440,7 +441,7 @@ def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data
         group = [names[i] for i in np.flatnonzero(share > MOST_FAULTY)]
         first = next(span for span in clear if int(share.argmax()) in span.channels)
         raise DisagreementError(
-            f"{' or '.join(group)} disagrees with the others in {100 * share.max():.0f} % of the recording (from"
+            f"{' or '.join(group)} disagrees with the others in {percent(share.max())} of the recording (from"
             f" {first.start:.1f} s): faulty; repair it, leave this part out with --start and --end, or name it in"
             " excluded_channels"
         )

@@ -68,7 +68,7 @@ from fdi_ros.setup.run import (
     Tried,
     times_words,
 )
-from fdi_ros.system.text import LINE, figures, first_of, listed, shown, span
+from fdi_ros.system.text import LINE, figures, first_of, listed, percent, shown, span
 
 #: uncertainty of the axes along a direction of the body from which they are not well
 #: shown
@@ -173,7 +173,7 @@ def _quietest(share: float) -> str:
     """Return in which part of the recording the noise is the quietest."""
     if share > 0.995:
         return "over the whole recording"
-    return f"in the quietest {100 * share:.0f} % of the recording"
+    return f"in the quietest {percent(share)} of the recording"
 
 
 def _position(axis: str, value: float, error: float) -> str:
@@ -236,7 +236,7 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
         words += " motors off"
         yield Finding(Role.UNKNOWN, "rest", words, error=common)
     elif share <= LEAST_SUPPORT:
-        words = f"noise_std is from the quietest {100 * share:.0f} % of the recording: a longer"
+        words = f"noise_std is from the quietest {percent(share)} of the recording: a longer"
         words += " rest gives a better value"
         yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=LEAST_SUPPORT)
     error = result.axis_errors
@@ -580,13 +580,13 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         )
     elif tried.judged < LEAST_JUDGED:
         note = tried.note or "channels are missing"
-        words = f"the monitor judges only {100 * tried.judged:.0f} % of the samples in the proof: {note}"
+        words = f"the monitor judges only {percent(tried.judged)} of the samples in the proof: {note}"
         yield Finding(
             warning, "judged", words, (), tried.judged, None, LEAST_JUDGED, "DO NOT USE"
         )
     elif tried.declared:
-        words = f"the monitor declares {times_words(tried.declared)} in {proof.source}: a gyro is faulty there, or the"
-        words += " settings are wrong"
+        words = f"the monitor declares {times_words(tried.declared)} in {proof.source}: a sensor is faulty"
+        words += " there, or the settings are wrong"
         yield Finding(
             warning, "declared", words, list(tried.declared), headline="DO NOT USE"
         )
@@ -842,7 +842,7 @@ def _mounts(found: SetupResult) -> list[Column]:
     mounts = found.mounts
     known = [mount.shown for mount in mounts]
     shared = [
-        f"{max(mount.shared, 0.0):.1%}" if k else "-" for k, mount in enumerate(mounts)
+        percent(max(mount.shared, 0.0)) if k else "-" for k, mount in enumerate(mounts)
     ]
     return [
         Column("unit", found.config.imu_names[: len(mounts)], ("unit",)),
@@ -901,7 +901,7 @@ def _tried(found: SetupResult, unit: Unit = RADIANS) -> list[Column]:
     return [
         Column("", ("before", "new"), ("settings",)),
         Column("", declared, ("declared",)),
-        Column("judged", [one.judged for one in both], ("judged",), ".0%"),
+        Column("judged", [one.judged for one in both], ("judged",), percent),
         Column("declared", [declared_figures(one.baseline) for one in both]),
         Column("isolated", isolated),
         Column(

@@ -58,7 +58,7 @@ from fdi_ros.setup.calibrate import (
     reference_channels,
 )
 from fdi_ros.setup.mounting import Mounting, assess
-from fdi_ros.system.text import first_of, shown
+from fdi_ros.system.text import first_of, percent, shown
 
 #: biases of gyros tried, rad/s, and of accelerometers, m/s^2
 SIZES = (0.03, 0.1, 0.3)
@@ -145,8 +145,8 @@ class Proof:
             return f"the new settings declare {times_words(new)}"
         # Smaller losses occur at the edge of a gap.
         if before.judged - after.judged > 0.02:
-            words = f"the new settings judge {100 * after.judged:.0f} % of the samples"
-            return f"{words} instead of {100 * before.judged:.0f} %"
+            words = f"the new settings judge {percent(after.judged)} of the samples"
+            return f"{words} instead of {percent(before.judged)}"
         # One fewer is chance.
         if tried_before == tried and was - now > 1:
             return f"the new settings isolate {now} of {tried} biases instead of {was}"

@@ -113,6 +113,22 @@ def figures(value: float, digits: int = 3, sign: str = "") -> str:
     return f"{value:{sign}.0f}" if "e+" in text else text
 
 
+def percent(share: float | None) -> str:
+    """Write a share in percent, or a dash: ``51 %``, ``0.4 %``, ``99.7 %``.
+
+    Only none and all are ``0 %`` and ``100 %``.
+    """
+    if share is None or not math.isfinite(share):
+        return "-"
+    value = 100.0 * share
+    from_end = min(value, 100.0 - value)
+    if not 1e-9 < from_end < 0.5:
+        return f"{value:.0f} %"
+    if from_end < 0.01:
+        return "below 0.01 %" if value < 50.0 else "above 99.99 %"
+    return f"{value:.{1 if from_end >= 0.1 else 2}f} %"
+
+
 def span(low: float, high: float, form: str) -> str:
     """Write a range, or one number if both ends read alike: ``28 to 35``."""
     first, last = f"{low:{form}}", f"{high:{form}}"

@@ -817,7 +817,7 @@ def test_how_much_is_done_is_a_bar_on_a_terminal_and_elsewhere_a_line_now_and_th
     monkeypatch.setattr("fdi_ros.cli.outputs.SAID_EVERY", 0.01)
     for stream, said in (
         (Terminal(), r" 50 %\|.* \r$"),
-        (io.StringIO(), r"(?m)^fdi: power, 50% done after 0 s, about 0 s left$"),
+        (io.StringIO(), r"(?m)^fdi: power, 50 % done after 0 s, about 0 s left$"),
     ):
         for quiet in (True, False):
             with progress(stream, quiet, "power") as show:
@@ -827,6 +827,6 @@ def test_how_much_is_done_is_a_bar_on_a_terminal_and_elsewhere_a_line_now_and_th
                 time.sleep(0.11)
             assert bool(re.search(said, stream.getvalue())) != quiet
             # While nothing more is done, how long it takes is not known.
-            lines = re.findall("50% done.*s left", stream.getvalue())
+            lines = re.findall("50 % done.*s left", stream.getvalue())
             assert len(lines) <= 1
             assert not quiet or stream.getvalue() == ""

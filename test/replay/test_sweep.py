@@ -175,7 +175,7 @@ def test_figures_of_a_vehicle_at_rest_are_called_that():
     text = sweep_text([at_rest], plan, "bag")
     # Of a dozen faults the share is not 95 %, whatever came of them.
     assert (
-        "bias: detected from 0.1 rad/s (12 of 12, 76% to 100%); isolated from 0.1 rad/s (12 of 12, 76%"
+        "bias: detected from 0.1 rad/s (12 of 12, 76 % to 100 %); isolated from 0.1 rad/s (12 of 12, 76 %"
         in text
     )
     assert "at 0 of the 2 start times: the vehicle was mostly AT REST" in text
