@@ -122,6 +122,7 @@ class RecentHealth:
                 # A short time of noise would count as the noise of the whole minute.
                 own_noise_rad_s=None if noisy else noise[i],
                 measured_in=one.unit,
+                drift=status.drift_since_rest(one),
             )
 
     def _was_noisy(self, status: Status, channel: ChannelStatus) -> bool:

@@ -228,6 +228,10 @@ class Status:
             acceleration=acceleration,
         )
 
+    def drift_since_rest(self, channel: ChannelStatus) -> float:
+        """Return how far a bias moved since it was learned at rest, or 0 if it was not."""
+        return channel.drift if self.bias_state.startswith("learned") else 0.0
+
     def has_implausible_start_bias(self, channel: ChannelStatus) -> bool:
         """Whether a channel is used that began with a bias no healthy gyro is expected to have."""
         return (

@@ -35,7 +35,7 @@ from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.soundness import RateHealth, UnitHealth
-from fdi_ros.monitor.status import ChannelStatus, Status
+from fdi_ros.monitor.status import Status
 from fdi_ros.replay.episodes import STRETCH_GAP, Story, join_halves, pieces
 from fdi_ros.replay.health import (
     Deliveries,
@@ -259,7 +259,7 @@ class Judge(Walk):
             for one in status.channels
             if status.has_implausible_start_bias(one)
         ]
-        channels = tuple(self._channels(end, status.channels))
+        channels = tuple(self._channels(end, status))
         monitor = MonitorResult(
             channels=channels,
             units=tuple(self._units(status)),
@@ -309,9 +309,7 @@ class Judge(Walk):
             share=1.0 - missing / max(1, evaluation.samples),
         )
 
-    def _channels(
-        self, end: float, statuses: Sequence[ChannelStatus]
-    ) -> Iterator[ChannelResult]:
+    def _channels(self, end: float, status: Status) -> Iterator[ChannelResult]:
         """Yield the result of each channel. ``end``: time of its state, s."""
         evaluation = self.evaluation
         samples = max(1, self._values[0].samples)
@@ -324,12 +322,14 @@ class Judge(Walk):
         ]
         residual_rms = evaluation.residual_rms
         noise = self._usual_noise()
-        for i, status in enumerate(statuses):
-            changes = [one for one in evaluation.events if one.channel == status.name]
-            before = [one for one in changes if one.at_s <= end]
-            state = status.state.name
+        for i, one in enumerate(status.channels):
+            changes = [
+                change for change in evaluation.events if change.channel == one.name
+            ]
+            before = [change for change in changes if change.at_s <= end]
+            state = one.state.name
             since = None
-            reason = status.reason.value
+            reason = one.reason.value
             if before:
                 state = before[-1].state
                 since = before[-1].at_s
@@ -339,14 +339,14 @@ class Judge(Walk):
                 reason = ""
             delivered = float(finite_values[i]) / samples
             unchecked = float(evaluation.unchecked[i])
-            noisy = status.longest_noisy
+            noisy = one.longest_noisy
             yield ChannelResult(
-                name=status.name,
+                name=one.name,
                 unit=units[i],
-                measured_in=status.unit,
+                measured_in=one.unit,
                 checked=min(1.0, (1.0 - unchecked) / delivered) if delivered else 0.0,
                 delivered=delivered,
-                spikes=status.counts["spikes"],
+                spikes=one.counts["spikes"],
                 saturated_s=float(saturated[i]) / (self.rate or math.inf),
                 noisy_s=noisy.seconds,
                 noisy_from_s=evaluation.time(noisy.since) if noisy.since else 0.0,
@@ -357,8 +357,9 @@ class Judge(Walk):
                 state=state,
                 since_s=since,
                 reason=reason,
-                bias_followed=status.drift,
-                noise=status.noise or None,
+                drift=status.drift_since_rest(one),
+                bias_followed=one.drift,
+                noise=one.noise or None,
                 unchecked=unchecked,
             )
 

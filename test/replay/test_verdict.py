@@ -369,19 +369,8 @@ def test_delays_in_the_table_and_in_the_notes_have_one_reference(fdi, tmp_path):
 
 
 @pytest.mark.parametrize(("faulty", "word"), [(False, "LOOK"), (True, "FAULTY")])
-@pytest.mark.parametrize(
-    ("log_too", "words"),
-    [
-        (
-            False,
-            r"the clocks of all units were set back by 4\.99 s during the recording",
-        ),
-        (True, r"the times of recording go back by 4\.99 s: a clock was set, and"),
-    ],
-)
-def test_the_first_line_says_that_clocks_were_set(
-    log_too, words, faulty, word, fdi, tmp_path
-):
+@pytest.mark.parametrize("log_too", [False, True])
+def test_the_first_line_says_that_clocks_were_set(log_too, faulty, word, fdi, tmp_path):
     """Messages have two times: of recording, which orders them, and the stamp inside."""
     time = np.arange(0, 30, 0.01)
     random = np.random.default_rng(3)
@@ -401,7 +390,9 @@ def test_the_first_line_says_that_clocks_were_set(
         ]
     bag = write_mcap(tmp_path / "bag.mcap", messages)
     first = fdi("replay", bag).out.splitlines()[0]
-    assert re.match(rf"{word}: .*{words}", first, re.IGNORECASE), first
+    words = "the clocks of all units were set back by 4.99 s during the recording"
+    assert first.startswith(f"{word}: ")
+    assert words in first.replace("The", "the")
     inspected = fdi("inspect", bag).out.splitlines()[0]
     assert "go back by up to 4.99 s: a clock was set" in inspected
 
@@ -511,6 +502,32 @@ def test_what_to_do_is_said_once_for_each_kind_of_trouble():
     assert advice_on(concerns_of(some)) == (
         "choose a larger range for b; check wiring and power supply of a and b"
     )
+
+
+def test_gyros_whose_biases_move_far_are_named_though_nothing_is_declared():
+    """A monitor follows what may be a change of all biases, and goes on without a declaration."""
+    some = [
+        ChannelHealth(name="a.x", unit="a", drift=-0.031),
+        ChannelHealth(name="a.y", unit="a", drift=0.026),
+        ChannelHealth(name="b.y", unit="b", drift=0.019),
+        ChannelHealth(name="b.accel_z", unit="b", measured_in="m/s^2", drift=0.5),
+    ]
+    (one,) = concerns_of(some)
+    assert str(one) == (
+        "a.x and a.y have biases that moved by up to 0.031 rad/s since it was learned at rest"
+    )
+    assert word_of([one]) is Word.LOOK
+    assert one.advice.startswith("let a warm up before the flight")
+
+
+def test_the_gyros_that_drift_before_a_real_crash_are_named(fdi):
+    """IMU 1 warms by 10 K and drifts to 26 and -31 mrad/s; the vehicle crashes at 75 s."""
+    log = LOGS / "quad_imu0_warms_and_crashes.bin"
+    if not log.exists():
+        pytest.skip(f"the recorded data is not there: ../shared/data/logs/{log.name}")
+    result = fdi("replay", log)
+    assert result.code != 0
+    assert "imu_1.x and imu_1.y" in result.out.partition("What to do")[0]
 
 
 @pytest.mark.parametrize("word", [Word.LOOK, Word.CANNOT_TELL])
