@@ -514,7 +514,7 @@ def test_gyros_whose_biases_move_far_are_named_though_nothing_is_declared():
     ]
     (one,) = concerns_of(some)
     assert str(one) == (
-        "a.x and a.y have biases that moved by up to 0.031 rad/s since it was learned at rest"
+        "a.x and a.y have biases that moved by up to 0.031 rad/s since the start at rest"
     )
     assert word_of([one]) is Word.LOOK
     assert one.advice.startswith("let a warm up before the flight")
