@@ -533,13 +533,22 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
             headline="USABLE, BUT LOOK",
             advice=Trouble.LEFT_OUT.advice([topic]),
         )
-    yield from message_findings(found.chosen, LOOK)
-    yield from bad_values(found.chosen, LOOK)
-    yield from topic_findings(found.chosen, unit)
+    of_messages = [
+        *message_findings(found.chosen, LOOK),
+        *bad_values(found.chosen, LOOK),
+        *topic_findings(found.chosen, unit),
+    ]
+    yield from of_messages
     tried = found.proof.before if found.kept else found.proof.after
     if tried.baseline is not None:
-        # A replay with these settings would give the same reasons to look.
+        said = {one.advice for one in of_messages}
+        topic_of = dict(zip(units, source_of(found.config).topics, strict=False))
+        # A replay with these settings would give the same reasons to look. What the whole
+        # recording shows by its topics is not repeated for a part of it.
         for one in tried.baseline.judgement.concerns:
+            topics = [topic_of.get(name.partition(".")[0], name) for name in one.who]
+            if one.trouble.advice(topics) in said:
+                continue
             yield Finding(
                 Role.WARNING,
                 "health",

@@ -133,6 +133,14 @@ def test_inspect_asks_for_a_look_where_a_replay_will(file, words, fdi):
 
 
 @needs_cases
+def test_setup_says_once_what_messages_and_its_own_replay_show(fdi, tmp_path):
+    case = CASES / "all_saturate_2000dps.csv"
+    first = fdi("setup", case, "--output", tmp_path / "a.yaml").out.splitlines()[0]
+    assert first.count("reached the end of the range") == 1
+    assert first.count("choose a larger range") == 1
+
+
+@needs_cases
 def test_spikes_are_counted_on_their_channel_alone(fdi, tmp_path):
     file, told = CASES / "spikes_5_every_1s.csv", tmp_path / "told.json"
     settings = CASES / "clean_settings.yaml"
