@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +32,7 @@ from fdi_ros.inspection.fitness import (
 from fdi_ros.inspection.topics import topic_columns
 from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array
-from fdi_ros.monitor.soundness import Trouble
+from fdi_ros.monitor.soundness import LEAST_DRIFT_RAD_S, Trouble
 from fdi_ros.replay.sweep_report import declared_figures
 from fdi_ros.report.layout import (
     FORCES,
@@ -431,6 +431,12 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
         yield Finding(
             Role.WARNING, "noise", words, who, float(noise[worst]), None, beside
         )
+    swing = np.ptp(found.curve, axis=0)
+    if far := [names[i] for i in np.flatnonzero(swing >= LEAST_DRIFT_RAD_S)]:
+        most = f"{swing.max() * unit.factor:.2g} {unit.name}"
+        words = f"the bias of {listed(far)} moved by up to {most} within the recording"
+        advice = Trouble.DRIFT.advice(far)
+        yield Finding(Role.WARNING, "drift", words, far, headline=LOOK, advice=advice)
     for one in _bounds(result, unit):
         beyond = np.flatnonzero(np.abs(one.values) > one.bound)
         if not len(beyond):
@@ -539,24 +545,7 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
         *topic_findings(found.chosen, unit),
     ]
     yield from of_messages
-    tried = found.proof.before if found.kept else found.proof.after
-    if tried.baseline is not None:
-        said = {one.advice for one in of_messages}
-        topic_of = dict(zip(units, source_of(found.config).topics, strict=False))
-        # A replay with these settings would give the same reasons to look. What the whole
-        # recording shows by its topics is not repeated for a part of it.
-        for one in tried.baseline.judgement.concerns:
-            topics = [topic_of.get(name.partition(".")[0], name) for name in one.who]
-            if one.trouble.advice(topics) in said:
-                continue
-            yield Finding(
-                Role.WARNING,
-                "health",
-                f"in {found.proof.source}, {one}",
-                one.who,
-                headline="USABLE, BUT LOOK",
-                advice=one.advice,
-            )
+    yield from _looks_of_proof(found, {one.advice for one in of_messages})
     limits = [
         line
         for line in pair_lines(mounting)
@@ -564,6 +553,31 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
     ]
     if limits:
         yield Finding(Role.WARNING, "mounting", "; ".join(limits))
+
+
+def _looks_of_proof(found: SetupResult, said: Collection[str]) -> Iterator[Finding]:
+    """Yield the reasons to look that a replay with these settings gives.
+
+    What the whole recording shows by its topics, with advice that was ``said``, is not
+    repeated for a part of it.
+    """
+    tried = found.proof.before if found.kept else found.proof.after
+    if tried.baseline is None:
+        return
+    source = source_of(found.config)
+    topic_of = dict(zip(source.names, source.topics, strict=True))
+    for one in tried.baseline.judgement.concerns:
+        topics = [topic_of.get(name.partition(".")[0], name) for name in one.who]
+        if one.trouble.advice(topics) in said:
+            continue
+        yield Finding(
+            Role.WARNING,
+            "health",
+            f"in {found.proof.source}, {one}",
+            one.who,
+            headline=LOOK,
+            advice=one.advice,
+        )
 
 
 def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:

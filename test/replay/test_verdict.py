@@ -528,7 +528,7 @@ def test_gyros_whose_biases_move_far_are_named_though_nothing_is_declared():
     assert one.advice.startswith("let a warm up before the flight")
 
 
-def test_the_gyros_that_drift_before_a_real_crash_are_named(fdi):
+def test_the_gyros_that_drift_before_a_real_crash_are_named(fdi, tmp_path):
     """IMU 1 warms by 10 K and drifts to 26 and -31 mrad/s; the vehicle crashes at 75 s."""
     log = LOGS / "quad_imu0_warms_and_crashes.bin"
     if not log.exists():
@@ -536,6 +536,8 @@ def test_the_gyros_that_drift_before_a_real_crash_are_named(fdi):
     result = fdi("replay", log)
     assert result.code != 0
     assert "imu_1.x and imu_1.y" in result.out.partition("What to do")[0]
+    first = fdi("setup", log, "--output", tmp_path / "a.yaml").out.splitlines()[0]
+    assert "the bias of imu_1.x and imu_1.y moved by up to 0.03 rad/s" in first
 
 
 @pytest.mark.parametrize("word", [Word.LOOK, Word.CANNOT_TELL])
