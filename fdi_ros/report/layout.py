@@ -354,7 +354,7 @@ class Link(str):
 
 def _cell(text: str, tag: str = "td") -> str:
     # Only sentences wrap, figures and names do not.
-    content = escape(text)
+    content = escape(text).replace(" %", "&nbsp;%")
     if isinstance(text, Link) and text.page:
         content = f'<a href="{html.escape(quote(text.page))}">{content}</a>'
     # Longer texts may wrap.

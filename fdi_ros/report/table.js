@@ -5,7 +5,7 @@
 
 // A cell that is a figure as a whole: with a unit (62.5 Hz), an interval (93.2% to 98.1%), a remark (0 (at most 2.83%)).
 const NUMBER = "[-+]?\\d+(?:\\.\\d+)?(?:e[-+]?\\d+)?";
-const UNIT = "(?: ?%| [^\\d\\s()]+)?";
+const UNIT = "(?:\\s?%| [^\\d\\s()]+)?";
 const FIGURE = new RegExp(`^(${NUMBER})${UNIT}(?: to ${NUMBER}${UNIT})?(?: \\(.*\\))?$`, "i");
 
 const figure = (text) => {
