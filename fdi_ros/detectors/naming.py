@@ -92,7 +92,9 @@ checks. With 0.03, a healthy gyro is named in 6 of 320 simulated flights with bo
 and heat, with 0.1 in 4. With 0.1 among few, 0.02 rad/s on a cone of six is never named."""
 SHIFTED_SLOWLY = 1.0
 """The same where the evidence has grown slowly, as while sensors warm: a sudden fault shows
-sooner. Else a healthy gyro of six is named in 7 of 72 simulated flights that warm by 20 mrad/s."""
+sooner. Else a healthy gyro of six is named in 7 of 72 simulated flights that warm by 20 mrad/s.
+Not where more than `FEW_CHECKS` checks find all errors in one unit: the drift of an IMU that ended
+in a real crash was never declared so."""
 FEW_CHECKS = 3
 """With so few checks, three faults or a shift explain any mean."""
 SET_MARGIN = 5.0
@@ -145,6 +147,7 @@ class Inference:
     whole: Wholes  # 1: the hypothesis calls the gyros healthy
     may_shift: Flag  # 1: all biases may have shifted
     slow: Flag  # 1: the evidence has grown slowly
+    alone: Flag  # 1: errors of one unit leave only noise
     shifts: Odds  # standard deviation of the shift in each hypothesis, rad/s; 0: none
     # The answer:
     log_odds: Real  # log odds of the likeliest hypothesis against no fault
@@ -432,6 +435,7 @@ def add_units(params: Constants, inference: Inference) -> None:
     axes = params.sensors.axes
     rate = inference.rate
     prior = math.log(COINCIDENCE / max(params.units, 1))
+    inference.alone = False
     for unit in range(params.units):
         inside = params.members[unit] & inference.mask
         count = 0
@@ -450,6 +454,8 @@ def add_units(params: Constants, inference: Inference) -> None:
             inside,
             False,
         )
+        explains = leaves_noise(inference, n, inside, inference.fit)
+        inference.alone = explains or inference.alone != 0
         if inference.moved > 0.0:
             std = WARMS_BY * inference.moved
             odds = log_ratio(inference, n, count, std * std)
@@ -475,7 +481,9 @@ def add_shifts(inference: Inference, n: int, largest: float) -> None:
     """
     few = redundancy(inference.mask, n) <= FEW_CHECKS
     likely = SHIFTED_AMONG_FEW if few else SHIFTED
-    prior = math.log((SHIFTED_SLOWLY if inference.slow else likely) / SHIFTS)
+    if inference.slow and (few or not inference.alone):
+        likely = SHIFTED_SLOWLY
+    prior = math.log(likely / SHIFTS)
     std = SMALLEST_SHIFT * largest
     set_direction(inference, n, 0, -1)
     for _ in range(SHIFTS):

@@ -340,7 +340,7 @@ def test_verb_writes_a_config_that_works(recording, tmp_path, fdi, refused):
     code, out, _ = fdi(*words, "--output", output, "--report", report)
     assert code == 0
     assert "(not used for fitting)" in out
-    assert re.search(r"^new +nothing +100 % +18 of 18", out, re.MULTILINE)
+    assert re.search(r"^new +nothing +99.93 % +18 of 18", out, re.MULTILINE)
     Pipeline.from_config(Config.from_file(output))
     assert "<h2>Proof</h2>" in report.read_text()
     assert re.search(r"noise_std 0.0018 to 0.004\d* rad/s", out)
