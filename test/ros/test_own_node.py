@@ -394,8 +394,8 @@ def test_what_is_odd_about_clocks_is_named_and_lived_with(tmp_path) -> None:
         listener.calm()
         listener.play(healthy(250)[1])
         for name in ("imu_1", "imu_2"):
-            assert wait(
-                lambda name=name: listener.status(f"input {name}").message == "delivers"
+            assert listener.says(
+                f"input {name}", "delivers", lambda: listener.play(healthy(50)[1])
             )
 
         # Both far from now: the time begins anew when both units agree on it.
