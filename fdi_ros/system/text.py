@@ -122,7 +122,7 @@ def percent(share: float | None) -> str:
         return "-"
     value = 100.0 * share
     from_end = min(value, 100.0 - value)
-    if not 1e-9 < from_end < 0.5:
+    if not 1e-9 < from_end <= 0.5:
         return f"{value:.0f} %"
     if from_end < 0.01:
         return "below 0.01 %" if value < 50.0 else "above 99.99 %"
