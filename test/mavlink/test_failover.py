@@ -6,6 +6,7 @@
 import copy
 import copyreg
 import errno
+import functools
 import json
 import math
 import os
@@ -163,19 +164,62 @@ def until(talk: Monitored, condition: Callable[[], bool]) -> bool:
     return condition()
 
 
+class Moved:
+    """Motion of three IMUs that a test changes in flight, with noise of 2 mrad/s."""
+
+    def __init__(self, *rate: float, noise: float = 0.002) -> None:
+        self.rate = np.array(rate)
+        #: Factors by IMU and axis, and standard deviations by IMU that replace 2 mrad/s.
+        self.scale = np.ones((3, 3))
+        self.noise = np.full((3, 1), noise)
+        self.random = np.random.default_rng(1)
+
+    def __call__(self, t: float) -> np.ndarray:
+        wobble = self.rate * (1.0 + 0.3 * math.sin(3.0 * t))
+        return wobble * self.scale + self.noise * self.random.normal(size=(3, 3))
+
+
 @pytest.fixture(scope="module")
-def flight_of_13_s(tmp_path_factory: pytest.TempPathFactory) -> Monitored:
-    autopilot = Autopilot("ardupilot", late_reads=80 * MS)
-    talk = Monitored(tmp_path_factory.mktemp("flight"), autopilot).run(10.0)
-    autopilot.armed = True
-    return talk.run(3.0)
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Monitored]:
+    """Flights that several tests begin with, each flown once: 10 s on the ground, 3 s armed."""
+
+    @functools.cache
+    def fly(limit: int = 0, motion: tuple[float, ...] = (), **settings) -> Monitored:
+        moved = Moved(*motion[:3], noise=motion[3]) if motion else None
+        autopilot = Autopilot("ardupilot", motion=moved, **settings)
+        folder = tmp_path_factory.mktemp("flight")
+        talk = Monitored(folder, autopilot, limit=limit).run(10.0)
+        autopilot.armed = True
+        return talk.run(3.0)
+
+    return fly
 
 
 @pytest.fixture
-def flying(
-    flight_of_13_s: Monitored, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Monitored:
-    return flight_of_13_s.copy(tmp_path, monkeypatch)
+def begin(
+    flown: Callable[..., Monitored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Monitored]:
+    """Begin with such a flight, whose file is in the folder of the test."""
+    return lambda **settings: flown(**settings).copy(tmp_path, monkeypatch)
+
+
+@pytest.fixture
+def flying(begin: Callable[..., Monitored]) -> Monitored:
+    return begin(late_reads=80 * MS)
+
+
+Moving = Callable[..., tuple[Monitored, Moved]]
+
+
+@pytest.fixture
+def moving(begin: Callable[..., Monitored]) -> Moving:
+    """Begin with a flight at some rate, rad/s: the flight and its motion."""
+
+    def fly(*rate: float, noise: float = 0.002) -> tuple[Monitored, Moved]:
+        talk = begin(motion=(*rate, noise))
+        return talk, talk.autopilots[0].motion
+
+    return fly
 
 
 # What it does in flight ----------------------------------------------------------------
@@ -248,13 +292,10 @@ def test_a_late_answer_puts_no_bad_imu_back_beside_the_one_that_healed(
 
 
 def test_a_harmless_error_is_no_lost_lane_and_no_odd_one_beside_a_worse(
-    tmp_path: Path,
+    begin: Callable[..., Monitored],
 ) -> None:
     """IMU 2 is FAULTY for ever on z, and apart on x only from IMU 3, which fails and heals."""
-    autopilot = Autopilot("ardupilot", late_reads=80 * MS)
-    flying = Monitored(tmp_path, autopilot, limit=1).run(10.0)
-    autopilot.armed = True
-    flying.run(3.0)
+    flying = begin(late_reads=80 * MS, limit=1)
     flying.fault(2, [0.0, 0.0, 0.02], (OK, OK, FAULTY), 5.0)
     flying.fault(1, 0.1, seconds=4.0)
     assert flying.in_use == [False, True, True]
@@ -265,11 +306,10 @@ def test_a_harmless_error_is_no_lost_lane_and_no_odd_one_beside_a_worse(
     assert "IMU 2 differs from the others" not in flying.texts
 
 
-def test_with_a_limit_a_worse_imu_is_announced_and_stays(tmp_path: Path) -> None:
-    autopilot = Autopilot("ardupilot")
-    flying = Monitored(tmp_path, autopilot, limit=1).run(10.0)
-    autopilot.armed = True
-    flying.run(3.0)
+def test_with_a_limit_a_worse_imu_is_announced_and_stays(
+    begin: Callable[..., Monitored],
+) -> None:
+    flying = begin(late_reads=80 * MS, limit=1)
     flying.fault(2, 0.3, seconds=4.0)
     flying.fault(3, 1.0, seconds=4.0)
     assert flying.in_use == [True, False, True]
@@ -662,13 +702,11 @@ def test_an_imu_that_healed_while_the_link_was_cut_stays_in_use(
     assert not any(DANGER in text for text in flying.texts)
 
 
-def test_two_imus_that_differ_are_no_name(tmp_path: Path) -> None:
-    autopilot = Autopilot("ardupilot", units=2)
-    talk = Monitored(tmp_path, autopilot).run(10.0)
-    autopilot.armed = True
+def test_two_imus_that_differ_are_no_name(begin: Callable[..., Monitored]) -> None:
+    talk = begin(units=2)
     talk.states[:6] = [AMBIGUOUS] * 6
     talk.fault(1, 0.5, [AMBIGUOUS] * 3, seconds=5.0)
-    assert not autopilot.sets
+    assert not talk.autopilots[0].sets
 
 
 def test_a_fault_whose_onset_nobody_saw_is_answered(flying: Monitored) -> None:
@@ -764,32 +802,9 @@ def test_a_slow_disk_holds_up_no_order(
     flying.failover.close()
 
 
-class Moved:
-    """Motion of three IMUs that a test changes in flight, with noise of 2 mrad/s."""
-
-    def __init__(self, *rate: float, noise: float = 0.002) -> None:
-        self.rate = np.array(rate)
-        #: Factors by IMU and axis, and standard deviations by IMU that replace 2 mrad/s.
-        self.scale = np.ones((3, 3))
-        self.noise = np.full((3, 1), noise)
-        self.random = np.random.default_rng(1)
-
-    def __call__(self, t: float) -> np.ndarray:
-        wobble = self.rate * (1.0 + 0.3 * math.sin(3.0 * t))
-        return wobble * self.scale + self.noise * self.random.normal(size=(3, 3))
-
-
-def moving(path: Path, *rate: float, noise: float = 0.002) -> tuple[Monitored, Moved]:
-    """Return an armed flight and its motion."""
-    moved = Moved(*rate, noise=noise)
-    talk = Monitored(path, Autopilot("ardupilot", motion=moved)).run(10.0)
-    talk.autopilots[0].armed = True
-    return talk.run(3.0), moved
-
-
-def test_a_dead_axis_stays_out_until_a_turn_about_it(tmp_path: Path) -> None:
+def test_a_dead_axis_stays_out_until_a_turn_about_it(moving: Moving) -> None:
     """Two seconds of yaw prove nothing about roll."""
-    talk, moved = moving(tmp_path, 1.0, 0.2, 0.1)
+    talk, moved = moving(0.4, 0.3, 0.1)
     moved.scale[0, 0] = 0.0
     talk.fault(1, 0.0, (FAULTY, OK, OK), seconds=2.0)
     assert talk.in_use == [False, True, True]
@@ -801,8 +816,8 @@ def test_a_dead_axis_stays_out_until_a_turn_about_it(tmp_path: Path) -> None:
     assert talk.run(4.0).in_use == [True, True, True]
 
 
-def test_a_lost_part_of_the_scale_stays_out_in_slow_turns(tmp_path: Path) -> None:
-    talk, moved = moving(tmp_path, 2.0, 0.1, 0.1)
+def test_a_lost_part_of_the_scale_stays_out_in_slow_turns(moving: Moving) -> None:
+    talk, moved = moving(2.0, 0.1, 0.1)
     moved.scale[0, 0] = 0.7
     talk.fault(1, 0.0, (FAULTY, OK, OK), seconds=2.0)
     assert talk.in_use == [False, True, True]
@@ -813,10 +828,10 @@ def test_a_lost_part_of_the_scale_stays_out_in_slow_turns(tmp_path: Path) -> Non
 @pytest.mark.parametrize("duration", [0.08, 1.0])
 @pytest.mark.parametrize("is_dead", [True, False])
 def test_a_short_error_in_a_hover_goes_back_after_a_turn(
-    tmp_path: Path, duration: float, is_dead: bool
+    moving: Moving, duration: float, is_dead: bool
 ) -> None:
     """Since then the gyro may be dead, which a hover does not show."""
-    talk, moved = moving(tmp_path, 0.2, 0.2, 0.02)
+    talk, moved = moving(0.4, 0.3, 0.1)
     moved.rate = np.array([0.01, 0.02, 0.01])
     talk.fault(2, 1.0, (OK, OK, OK), seconds=duration)
     moved.scale[1] = 0.0 if is_dead else 1.0
@@ -828,10 +843,10 @@ def test_a_short_error_in_a_hover_goes_back_after_a_turn(
 
 @pytest.mark.parametrize("is_dead", [True, False])
 def test_a_fast_turn_about_another_axis_hides_no_error(
-    tmp_path: Path, is_dead: bool
+    moving: Moving, is_dead: bool
 ) -> None:
     """5 % of a yaw of 2 rad/s is more than the error of each IMU on another axis."""
-    talk, moved = moving(tmp_path, 0.4, 0.3, 0.1)
+    talk, moved = moving(0.4, 0.3, 0.1)
     for imu, size in ((1, 0.12), (2, -0.1)):
         if is_dead:
             moved.scale[imu - 1, 0] = 0.0
@@ -862,10 +877,10 @@ def restarted(talk: Monitored, path: Path) -> Monitored:
 
 @pytest.mark.parametrize("flies", [True, False])
 def test_a_restart_of_the_companion_forgets_no_axis(
-    tmp_path: Path, flies: bool
+    moving: Moving, tmp_path: Path, flies: bool
 ) -> None:
     """Two dead gyros that go back in a turn about another axis would outvote the third."""
-    talk, moved = moving(tmp_path, 0.4, 0.3, 0.1)
+    talk, moved = moving(0.4, 0.3, 0.1)
     for imu in (1, 2):
         moved.scale[imu - 1, 0] = 0.0
         talk.fault(imu, 0.0, (FAULTY, OK, OK), seconds=1.0)
@@ -885,10 +900,10 @@ def test_a_restart_of_the_companion_forgets_no_axis(
 
 
 def test_two_gyros_that_die_in_a_hover_do_not_outvote_the_third(
-    tmp_path: Path,
+    moving: Moving,
 ) -> None:
     """At rest a dead gyro agrees, also after the monitor has named it."""
-    talk, moved = moving(tmp_path, 0.3, 0.3, 0.2)
+    talk, moved = moving(0.4, 0.3, 0.1)
     moved.rate = np.array([0.01, 0.01, 0.01])
     talk.run(2.0)
     for imu in (1, 2):
@@ -902,10 +917,10 @@ def test_two_gyros_that_die_in_a_hover_do_not_outvote_the_third(
 
 @pytest.mark.parametrize("bad", [(2,), (2, 3)])
 def test_bad_imus_that_scatter_beside_one_at_rest_stay_out(
-    tmp_path: Path, bad: tuple[int, ...]
+    moving: Moving, bad: tuple[int, ...]
 ) -> None:
     """A quiet gyro at rest repeats zero, in whole mrad/s: rest is no death."""
-    talk, moved = moving(tmp_path, 0.5, 0.3, 0.1, noise=0.0003)
+    talk, moved = moving(0.5, 0.3, 0.1, noise=0.0003)
     for imu in bad:
         moved.noise[imu - 1] = 0.1
         talk.fault(imu, (1.0, 0.0, 0.0), (FAULTY, OK, OK), seconds=2.0)
@@ -919,9 +934,9 @@ def test_bad_imus_that_scatter_beside_one_at_rest_stay_out(
 
 
 @pytest.mark.parametrize("state", [OK, STALE])
-def test_a_frozen_imu_is_out_where_two_others_agree(tmp_path: Path, state: int) -> None:
+def test_a_frozen_imu_is_out_where_two_others_agree(moving: Moving, state: int) -> None:
     """It repeats its value while others move, and differs: a monitor need not name it."""
-    talk, moved = moving(tmp_path, 0.02, 0.25, 0.05)
+    talk, moved = moving(0.02, 0.25, 0.05)
     moved.scale[0] = 0.0
     moved.noise[0] = 0.0
     talk.states[:3] = [state] * 3
@@ -938,9 +953,9 @@ def test_a_lesser_error_is_better_than_none_sound(flying: Monitored) -> None:
     assert flying.run(8.0).in_use == [True, True, True]
 
 
-def test_a_step_at_rest_says_nothing_of_the_others(tmp_path: Path) -> None:
+def test_a_step_at_rest_says_nothing_of_the_others(moving: Moving) -> None:
     """As in the check list of the docs: an offset of IMU 2, armed on the ground."""
-    talk, _ = moving(tmp_path, 0.0, 0.0, 0.0, noise=0.0003)
+    talk, _ = moving(0.0, 0.0, 0.0, noise=0.0003)
     talk.fault(2, 0.3, seconds=10.0)
     assert talk.in_use == [True, False, True]
     assert not any("IMU 3" in text or "IMU 1" in text for text in talk.texts)
@@ -1550,12 +1565,10 @@ def test_a_full_disk_at_a_start_in_flight_ends_nothing(
     assert kept(again, tmp_path, ())[1] == []
 
 
-def test_a_trade_needs_a_reserve(tmp_path: Path) -> None:
+def test_a_trade_needs_a_reserve(begin: Callable[..., Monitored]) -> None:
     """Of two IMUs both are bad: the one that is out stays out."""
-    autopilot = Autopilot("ardupilot", units=2)
-    talk = Monitored(tmp_path, autopilot).run(10.0)
-    autopilot.armed = True
-    talk.run(3.0)
+    talk = begin(units=2)
+    autopilot = talk.autopilots[0]
     talk.fault(2, 0.1, seconds=2.0)
     talk.fault(1, 1.0, seconds=3.0)
     assert [value for _, _, value in autopilot.sets][-1] == 0.0
