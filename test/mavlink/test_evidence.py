@@ -3,6 +3,8 @@
 
 """Evidence against an IMU: what raw rates and the monitor's states are enough for."""
 
+import copy
+import functools
 import math
 from collections.abc import Callable, Sequence
 
@@ -40,9 +42,7 @@ class Watched:
     stamps in whole milliseconds.
     """
 
-    def __init__(
-        self, count: int = 3, interval: int = STEP, loop: float = 1000.0
-    ) -> None:
+    def __init__(self, count: int, interval: int, loop: float) -> None:
         self.evidence = Evidence(count, interval, min_size=0.03)
         self.interval = interval
         self.loop = loop
@@ -55,7 +55,6 @@ class Watched:
         self.is_reporting = True
         self.now = START
         self.random = np.random.default_rng(1)
-        self.run(3.0)
 
     def rate(self, t: float) -> np.ndarray:
         """Return the rate of the vehicle at a time since the start, rad/s."""
@@ -91,6 +90,16 @@ class Watched:
         return found
 
 
+@functools.cache
+def after_3_s(count: int, interval: int, loop: float) -> Watched:
+    return Watched(count, interval, loop).run(3.0)
+
+
+def watch(count: int = 3, interval: int = STEP, loop: float = 1000.0) -> Watched:
+    """Return such a vehicle after 3 s. Most tests begin alike: it is run once and copied."""
+    return copy.deepcopy(after_3_s(count, interval, loop))
+
+
 def biased(size: float, axis: int = 0) -> Gyro:
     """Return a gyro with an error on one axis, rad/s."""
     return lambda rate: rate + size * np.eye(3)[axis]
@@ -98,7 +107,7 @@ def biased(size: float, axis: int = 0) -> Gyro:
 
 @pytest.mark.parametrize("size", [0.7, -1.0])
 def test_the_odd_one_of_three_is_blamed_without_the_monitor(size: float) -> None:
-    watched = Watched()
+    watched = watch()
     watched.gyros[1] = biased(size)
     assert watched.blamed(0.06) == {1}
     assert watched.blamed(1.0) == {1}
@@ -113,7 +122,7 @@ def test_two_gyros_that_stand_still_do_not_outvote_a_sound_one(
     between: float, state: int
 ) -> None:
     """One after the other, or at once; the monitor sees or does not see what they do."""
-    watched = Watched()
+    watched = watch()
     watched.gyros[0] = zero
     watched.run(between)
     watched.states[:3] = [state] * 3
@@ -124,7 +133,7 @@ def test_two_gyros_that_stand_still_do_not_outvote_a_sound_one(
 
 def test_two_that_die_in_one_hover_do_not_outvote_the_third() -> None:
     """The first is out; at rest it agrees with all others, and the second dies alike."""
-    watched = Watched()
+    watched = watch()
     dead = [lambda rate: 0.01 * rate] * 2
     watched.gyros[0] = dead[0]
     watched.states[:3] = [FAULTY] * 3
@@ -141,7 +150,7 @@ def test_two_that_die_in_one_hover_do_not_outvote_the_third() -> None:
 
 def test_two_that_are_dead_from_the_start_do_not_outvote_the_third() -> None:
     """All agree at rest. Only a turn shows that two gyros measure."""
-    watched = Watched()
+    watched = watch()
     watched.evidence = Evidence(3, STEP, min_size=0.03)
     turning = watched.rate
     watched.rate = lambda t: np.zeros(3)
@@ -156,14 +165,14 @@ def test_two_that_the_monitor_doubts_do_not_outvote_one_that_it_does_not(
     state: int,
 ) -> None:
     """Their values go on changing: a rate that is lost, but noise that is not."""
-    watched = Watched()
+    watched = watch()
     watched.states[:6] = [state] * 6
     watched.gyros[:2] = [lambda rate: 0.01 * rate] * 2
     assert 2 not in watched.blamed(8.0)
 
 
 def test_two_that_were_wrong_before_are_not_trusted_once_they_agree() -> None:
-    watched = Watched()
+    watched = watch()
     for k in (0, 1):
         watched.gyros[k] = lambda rate: 0.01 * rate
         watched.states[3 * k : 3 * k + 3] = [FAULTY] * 3
@@ -180,7 +189,7 @@ def test_two_that_were_bad_in_this_flight_do_not_outvote_one_that_was_not(
     taken: list[int], blamed: set[int], state: int
 ) -> None:
     """They do once they have agreed in turns about all axes."""
-    watched = Watched()
+    watched = watch()
     moving = watched.rate
     watched.rate = turning_about(0)
     watched.run(0.5).out = taken
@@ -203,7 +212,7 @@ def test_two_that_were_bad_in_this_flight_do_not_outvote_one_that_was_not(
 
 def test_held_imus_that_both_read_zero_do_not_agree() -> None:
     """And neither agrees with one in use that reads zero too, beside a sound one."""
-    watched = Watched()
+    watched = watch()
     watched.gyros[:2] = [zero, lambda rate: 0.01 * rate]
     watched.states[:6] = [FAULTY] * 6
     watched.states[6:] = [UNCHECKED] * 3
@@ -223,7 +232,7 @@ def test_held_imus_that_both_read_zero_do_not_agree() -> None:
 
 def test_a_gyro_that_is_stuck_does_not_agree_in_hover() -> None:
     """Its value is within 0.03 rad/s of the others', but does not follow them."""
-    watched = Watched(2)
+    watched = watch(2)
     watched.rate = lambda t: np.array([0.02 * math.sin(5.0 * t), 0.0, 0.0])
     watched.out = [0]
     watched.gyros[0] = zero
@@ -248,7 +257,7 @@ def test_an_imu_whose_samples_are_lost_is_not_stuck(lost: int) -> None:
 
 def test_two_dead_gyros_with_noise_do_not_outvote_the_third_by_its_set() -> None:
     """The monitor takes the first one back and has a set in the sound one."""
-    watched = Watched()
+    watched = watch()
     quiet = np.random.default_rng(2)
 
     def dead(rate: np.ndarray) -> np.ndarray:
@@ -267,7 +276,7 @@ def test_two_dead_gyros_with_noise_do_not_outvote_the_third_by_its_set() -> None
 
 
 def test_a_set_within_one_of_three_is_blamed_while_the_others_are_trusted() -> None:
-    watched = Watched()
+    watched = watch()
     watched.gyros[2] = biased(0.1)
     watched.states[6:] = [AMBIGUOUS] * 3
     assert watched.blamed(1.0) == {2}
@@ -281,7 +290,7 @@ def test_a_set_of_several_imus_names_the_odd_one_by_its_size_and_time(
     size: float, seconds: float, is_blamed: bool
 ) -> None:
     """One of three axes is wrong, and two of them agree: from 0.06 rad/s on it is the third."""
-    watched = Watched()
+    watched = watch()
     watched.rate = lambda t: 0.1 * np.array([math.sin(2.1 * t), math.cos(t), 0.5])
     watched.gyros[2] = biased(size)
     watched.states[::3] = [AMBIGUOUS] * 3
@@ -289,11 +298,11 @@ def test_a_set_of_several_imus_names_the_odd_one_by_its_size_and_time(
 
 
 def test_a_set_of_several_imus_without_an_odd_one_names_nobody() -> None:
-    watched = Watched()
+    watched = watch()
     watched.gyros[1:] = [biased(-0.1), biased(0.1)]
     watched.states[::3] = [AMBIGUOUS] * 3
     assert not watched.blamed(3.0)
-    watched = Watched()
+    watched = watch()
     watched.gyros[2] = biased(0.1)
     watched.states[1::3] = [AMBIGUOUS] * 3
     assert not watched.blamed(3.0), "a set of another axis"
@@ -304,7 +313,7 @@ def test_a_set_of_several_imus_without_an_odd_one_names_nobody() -> None:
 
 def test_an_oscillation_is_no_clear_error() -> None:
     """1.2 rad/s at 15 Hz on the axis x, and 9 Hz on y: the mean is zero."""
-    watched = Watched()
+    watched = watch()
     times = iter(np.arange(0.0, 100.0, 0.02))
 
     def shaken(rate: np.ndarray) -> Sequence[float]:
@@ -325,7 +334,7 @@ def test_an_imu_that_measures_later_is_not_blamed_in_hard_manoeuvres(
     delay: float,
 ) -> None:
     """Up to 60 rad/s^2: 1.2 rad/s within 20 ms."""
-    watched = Watched()
+    watched = watch()
     watched.rate = lambda t: np.array([6.0 * math.sin(10.0 * t), 0.0, 0.0])
     watched.gyros[2] = late_by(watched, delay)
     watched.states[6:] = [SUSPECT] * 3
@@ -334,7 +343,7 @@ def test_an_imu_that_measures_later_is_not_blamed_in_hard_manoeuvres(
 
 def test_a_named_imu_that_measures_later_is_not_blamed_in_manoeuvres() -> None:
     """Up to 8 rad/s^2: 0.06 rad/s within 7 ms. An error of 0.1 rad/s is blamed there."""
-    watched = Watched()
+    watched = watch()
     watched.rate = lambda t: np.array([2.0 * math.sin(4.0 * t), 0.0, 0.0])
     watched.gyros[2] = late_by(watched, 0.007)
     watched.states[6] = FAULTY
@@ -350,7 +359,7 @@ def test_a_named_imu_that_measures_later_is_not_blamed_in_manoeuvres() -> None:
 def test_an_error_of_scale_in_a_fast_turn_is_no_clear_error(
     turn: float, factor: float, is_blamed: bool
 ) -> None:
-    watched = Watched()
+    watched = watch()
     watched.rate = lambda t: np.array([turn, 0.0, 0.0])
     watched.gyros[2] = lambda rate: factor * rate
     assert watched.blamed(0.5) == ({2} if is_blamed else set())
@@ -358,7 +367,7 @@ def test_an_error_of_scale_in_a_fast_turn_is_no_clear_error(
 
 def test_a_named_gyro_within_the_tolerance_of_scales_is_not_blamed() -> None:
     """0.12 rad/s in a turn of 4 rad/s are 3 %; at rest they are an error."""
-    watched = Watched()
+    watched = watch()
     watched.rate = lambda t: np.array([4.0, 0.0, 0.0])
     watched.gyros[2] = lambda rate: 1.03 * rate
     watched.states[6] = FAULTY
@@ -373,7 +382,7 @@ def test_an_imu_that_oscillates_and_is_named_does_not_agree(
     size: float, hertz: float
 ) -> None:
     """A large oscillation is an error; a smaller one may be vibration: no order, no trust."""
-    watched = Watched()
+    watched = watch()
     watched.gyros[0] = lambda rate: (
         rate + size * np.sin(2.0 * math.pi * hertz * watched.now / NS) * np.eye(3)[0]
     )
@@ -401,7 +410,7 @@ def vibrating(
 @pytest.mark.parametrize("loop", [400.0, 300.0])
 def test_a_vibration_that_is_named_is_no_error(loop: float) -> None:
     """Each frequency is near a sum of multiples of the rates of messages and of the loop."""
-    watched = Watched(interval=NINE, loop=loop)
+    watched = watch(interval=NINE, loop=loop)
     for frequency in (65.5, 69.0, 78.0, 105.0, 116.5, 133.3, 155.6, 187.0):
         watched.states[6] = FAULTY
         watched.gyros[2] = vibrating(watched, 0.8, frequency)
@@ -411,7 +420,7 @@ def test_a_vibration_that_is_named_is_no_error(loop: float) -> None:
 
 
 def test_an_error_beside_a_vibration_is_blamed_all_the_same() -> None:
-    watched = Watched(interval=NINE, loop=400.0)
+    watched = watch(interval=NINE, loop=400.0)
     watched.states[6] = FAULTY
     watched.gyros[2] = vibrating(watched, 0.2, 66.0)
     assert not watched.blamed(2.0)
@@ -420,7 +429,7 @@ def test_an_error_beside_a_vibration_is_blamed_all_the_same() -> None:
 
 
 def test_an_imu_that_has_healed_agrees_under_usual_vibration() -> None:
-    watched = Watched(interval=NINE, loop=400.0)
+    watched = watch(interval=NINE, loop=400.0)
     watched.states[0] = FAULTY
     watched.out = [0]
     watched.gyros[0] = biased(1.0)
@@ -434,7 +443,7 @@ def test_a_pause_of_the_messages_makes_no_error_of_a_vibration(
     frequency: float,
 ) -> None:
     """After it the mean is of one sample, and nothing is known of the spread."""
-    watched = Watched(interval=NINE, loop=400.0)
+    watched = watch(interval=NINE, loop=400.0)
     watched.states[6] = FAULTY
     watched.gyros[2] = vibrating(watched, 0.3, frequency)
     watched.run(1.0)
@@ -445,7 +454,7 @@ def test_a_pause_of_the_messages_makes_no_error_of_a_vibration(
 
 def over_a_lossy_link(share: float, period: float = 0.0) -> Watched:
     """Return IMUs of whose messages a link loses a share, at random or each period, s."""
-    watched = Watched(interval=NINE, loop=400.0)
+    watched = watch(interval=NINE, loop=400.0)
     lost = np.random.default_rng(3)
     feed = watched.evidence.raw.feed
 
@@ -496,7 +505,7 @@ def test_an_error_over_a_link_that_loses_messages_is_blamed(share: float) -> Non
 
 def test_a_dead_gyro_with_noise_does_not_agree_in_a_quiet_hover() -> None:
     """Its rate differs from the others' only while they turn."""
-    watched = Watched()
+    watched = watch()
     watched.gyros[0] = lambda rate: 0.01 * rate
     watched.states[:3] = [FAULTY] * 3
     watched.run(1.0)
@@ -533,7 +542,7 @@ def test_an_imu_agrees_only_after_a_turn_about_each_axis_that_was_bad(
     is_seen: bool,
 ) -> None:
     """A spike on x, then y is dead: seen by less, or only named in a hover."""
-    watched = Watched()
+    watched = watch()
     spiked(watched, 0, axis=0, size=3.0)
     watched.rate = turning_about(1) if is_seen else hovering
     watched.gyros[0] = lambda rate: rate * np.array([1.0, 0.01, 1.0])
@@ -552,7 +561,7 @@ def test_an_imu_agrees_only_after_a_turn_about_each_axis_that_was_bad(
 
 
 def test_an_imu_that_is_out_without_a_known_axis_waits_for_turns_about_all() -> None:
-    watched = Watched()
+    watched = watch()
     watched.rate = turning_about(2)
     watched.run(0.5).out = [0]
     assert watched.run(2.0).step()[0].waits == "xy"
@@ -560,7 +569,7 @@ def test_an_imu_that_is_out_without_a_known_axis_waits_for_turns_about_all() -> 
 
 def test_a_contradiction_of_an_unnamed_imu_suspends_the_time_of_agreement() -> None:
     """The other one fails for half a second. A turn about its bad axis is needed after it."""
-    watched = Watched()
+    watched = watch()
     spiked(watched, 0, axis=0, size=3.0)
     watched.gyros[0] = sound
     watched.states[0] = OK
@@ -582,7 +591,7 @@ def test_a_contradiction_of_an_unnamed_imu_suspends_the_time_of_agreement() -> N
 
 def test_of_two_imus_that_fail_alike_each_differs_from_one_that_is_ok() -> None:
     """Both in use and FAULTY agree with each other: both are apart from the third."""
-    watched = Watched()
+    watched = watch()
     watched.gyros[:2] = [lambda rate: rate * np.array([1.0, 0.01, 1.0])] * 2
     watched.states[1] = watched.states[4] = FAULTY
     assert watched.blamed(1.0) == {0, 1}
@@ -592,7 +601,7 @@ def test_of_two_imus_that_fail_alike_each_differs_from_one_that_is_ok() -> None:
 
 
 def test_a_noisy_gyro_at_rest_does_not_make_the_others_stuck() -> None:
-    watched = Watched()
+    watched = watch()
     watched.gyros[1] = lambda rate: watched.random.normal(0.0, 0.03, 3)
     watched.gyros[0] = watched.gyros[2] = zero
     assert not any(imu.stuck for _ in range(300) for imu in watched.step())
@@ -600,7 +609,7 @@ def test_a_noisy_gyro_at_rest_does_not_make_the_others_stuck() -> None:
 
 def test_scales_explain_a_difference_until_the_turn_is_out_of_the_average() -> None:
     """A roll of 12 rad/s that stops within 60 ms, and a scale that is 3 % off."""
-    watched = Watched()
+    watched = watch()
     begun = watched.now
     watched.rate = lambda t: np.array(
         [
@@ -628,7 +637,7 @@ def test_samples_that_come_too_slowly_or_too_fast() -> None:
 
 
 def test_a_set_that_flickers_names_its_imu() -> None:
-    watched = Watched()
+    watched = watch()
     watched.gyros[2] = biased(0.1)
     found = set()
     for k in range(20):
@@ -641,7 +650,7 @@ def test_a_set_that_flickers_names_its_imu() -> None:
 
 
 def test_a_name_on_another_axis_is_no_witness() -> None:
-    watched = Watched()
+    watched = watch()
     watched.states[1] = FAULTY
     watched.gyros[0] = biased(0.2, axis=0)
     assert not watched.blamed(3.0)
@@ -654,7 +663,7 @@ def test_of_two_imus_an_old_name_is_no_witness_against_a_new_difference(
     state: int,
 ) -> None:
     """The monitor remembers a fault that is over; then the other gyro fails."""
-    watched = Watched(2)
+    watched = watch(2)
     watched.gyros[0] = biased(0.3)
     watched.states[0] = state
     assert watched.blamed(1.0) == {0}
@@ -673,7 +682,7 @@ def test_of_two_imus_an_old_name_is_no_witness_against_a_new_difference(
 
 def test_of_three_imus_an_old_name_counts_for_the_odd_one() -> None:
     """A fault that comes and goes while it stays declared."""
-    watched = Watched()
+    watched = watch()
     watched.states[0] = FAULTY
     watched.run(4.0)
     watched.gyros[0] = biased(0.1)
@@ -690,7 +699,7 @@ def test_an_old_name_counts_on_an_axis_on_which_the_others_agree(
     size: float, third: int, blamed: set[int]
 ) -> None:
     """A harmless error stays declared; another IMU fails on y; then the first error grows."""
-    watched = Watched()
+    watched = watch()
     watched.states[0] = FAULTY
     watched.run(4.0)
     watched.gyros[1] = biased(1.0, axis=1)
@@ -702,7 +711,7 @@ def test_an_old_name_counts_on_an_axis_on_which_the_others_agree(
 
 
 def test_a_monitor_that_died_names_nobody() -> None:
-    watched = Watched()
+    watched = watch()
     watched.states[0] = FAULTY
     watched.run(1.0)
     assert watched.step()[0].named is True
@@ -724,7 +733,7 @@ def test_rows_are_the_last_ones_in_their_order() -> None:
 
 def test_an_error_has_a_size_on_a_slow_link_too() -> None:
     """At 22 Hz two samples are all within the time over which it is averaged."""
-    watched = Watched(interval=45 * MS)
+    watched = watch(interval=45 * MS)
     watched.gyros[1] = biased(0.5)
     watched.run(1.0)
     axis, size = watched.evidence.error(1, watched.now) or ("", 0.0)
@@ -751,7 +760,7 @@ def test_a_doubt_of_two_is_refuted_once_they_have_agreed_for_a_time(
     stands: float, blamed: set[int]
 ) -> None:
     """The monitor may see a common fault of two before their raw rates show the fault."""
-    watched = Watched()
+    watched = watch()
     watched.states[:6] = [AMBIGUOUS, OK, OK] * 2
     watched.run(stands)
     watched.gyros[2] = biased(-0.7)
@@ -760,7 +769,7 @@ def test_a_doubt_of_two_is_refuted_once_they_have_agreed_for_a_time(
 
 def shaking_late() -> Watched:
     """Return IMUs in a vehicle that shakes, the first of which measures 2.5 ms later."""
-    watched = Watched(interval=NINE, loop=400.0)
+    watched = watch(interval=NINE, loop=400.0)
     watched.rate = lambda t: np.array([1.2 * math.sin(75.0 * t), 0.0, 0.0])
     watched.gyros[0] = late_by(watched, 0.0025)
     return watched
