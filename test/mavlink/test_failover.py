@@ -42,6 +42,9 @@ from mavlink.autopilots import (
 from mavlink.flights import Flight
 
 MS = 1_000_000
+#: Simulated time between two turns of failover, ns. A node takes them faster, and a turn
+#: costs a test as much as a simulated link of 15 ms.
+TURN = 40 * MS
 OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED = range(6)
 CHANNELS = [f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"]
 DANGER = "faulty AND IN USE: land"
@@ -61,7 +64,7 @@ def test_the_vehicle_never_loses_its_last_imu_by_our_hand(seeds: Sequence[int]) 
 
 
 class Monitored(Conversation):
-    """A conversation with failover and a monitor that reports given states, at 50 Hz."""
+    """A conversation with failover and a monitor that reports given states, each `TURN`."""
 
     def __init__(
         self,
@@ -102,8 +105,9 @@ class Monitored(Conversation):
             return copy.deepcopy(self, known)
 
     def run(self, seconds: float) -> "Monitored":
-        for _ in range(round(seconds * 50)):
-            super().run(0.02)
+        end = self.now + round(seconds * NS)
+        while self.now < end:
+            super().run(min(TURN, end - self.now) / NS)
             for _, sample in self.samples[self._fed :]:
                 self.failover.feed(sample)
             self._fed = len(self.samples)
