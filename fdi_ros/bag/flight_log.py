@@ -39,6 +39,7 @@ from fdi_ros.bag.flight_context import (
     Thinned,
 )
 from fdi_ros.bag.raw import NO_HORIZON, BagFile, Batch, Damage, LogText, Topic
+from fdi_ros.bag.recorder_clock import RecorderClock
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Bytes, Int
@@ -356,7 +357,7 @@ class FlightLog(BagFile):
         )
         return FlightContext(origins, temperatures, throttle, modes)
 
-    def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
+    def batches(self, topics: Sequence[str], clock: RecorderClock) -> Iterator[Batch]:
         """Read the messages of the topics, those of a portion in the order of their stamps."""
         sources = [source for source in self._sources if self._topic(source) in topics]
         if not sources:

@@ -35,14 +35,13 @@ class LibraryBag(BagFile):
         If the clock of the recorder was set back, in the order of writing.
         """
 
-    def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
+    def batches(self, topics: Sequence[str], clock: RecorderClock) -> Iterator[Batch]:
         """Read the messages of the topics."""
         chosen = {
             number: topics.index(one.name)
             for number, one in self._numbered.items()
             if one.name in topics
         }
-        clock = RecorderClock()
         whole = sum(self._numbered[number].count for number in chosen)
         read = 0
         found = self._messages(list(chosen)) if chosen else iter(())
@@ -52,7 +51,6 @@ class LibraryBag(BagFile):
             length = np.array([len(one) for one in data])
             topic = np.array([chosen[number] for number in numbers])
             log_time = clock.follow(topic, np.array(times, dtype=np.int64))
-            self.state_set_back(clock)
             disorder = LEAST_SET_BACK if clock.set_back else 0
             yield Batch(
                 buffer=np.frombuffer(b"".join(data), dtype=np.uint8),

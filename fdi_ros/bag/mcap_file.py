@@ -232,6 +232,7 @@ class McapFile(BagFile):
         steps_back = self._steps_back()
         self._found.sort(key=lambda piece: piece.start_time)
         self.start_time = self._found[0].start_time if self._found else NO_HORIZON
+        self.end_time = max((piece.end_time for piece in self._found), default=0)
         ends = np.cumsum([min(piece.raw_size, CHUNK_BYTES) for piece in self._found])
         self._pieces = self._found[: np.searchsorted(ends, most, side="right")]
         """In the order of time, those that unpack to no more than they may."""
@@ -282,9 +283,8 @@ class McapFile(BagFile):
             encoding = "cdr"
         return Topic(channel.topic, kind, encoding, self._counts.get(number, 0))
 
-    def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
+    def batches(self, topics: Sequence[str], clock: RecorderClock) -> Iterator[Batch]:
         """Read the messages of the topics."""
-        clock = RecorderClock()
         read = 0
         whole = sum(piece.size for piece in self._pieces)
         held = 0
@@ -317,7 +317,6 @@ class McapFile(BagFile):
             log_time = batch.log_time
             if self._follows_clock:
                 log_time = clock.follow(batch.topic, log_time)
-            self.state_set_back(clock)
             if horizon != NO_HORIZON:
                 horizon += clock.least_shift
             batch = replace(batch, log_time=log_time, horizon=horizon)

@@ -23,7 +23,7 @@ from fdi_ros.bag.recorder_clock import RecorderClock
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Bytes, Int
 from fdi_ros.system.files import FILES, open_regular
-from fdi_ros.system.text import figures, first_of, shown
+from fdi_ros.system.text import first_of, shown
 from fdi_ros.system.yaml_file import read_yaml
 
 #: characters shown about one place
@@ -192,6 +192,8 @@ class BagFile(ABC):
     topics: tuple[Topic, ...]
     #: time of the first message, ns, or `NO_HORIZON`
     start_time: int
+    #: time of the last message of a file that may be a part of a recording, ns
+    end_time: int = 0
     texts: tuple[LogText, ...] = ()
     #: temperatures, throttle, flight modes
     context: FlightContext = FlightContext()
@@ -222,8 +224,8 @@ class BagFile(ABC):
         raise BagError(f"{path} {refusal}")
 
     @abstractmethod
-    def batches(self, topics: Sequence[str]) -> Iterator[Batch]:
-        """Read the messages of the topics."""
+    def batches(self, topics: Sequence[str], clock: RecorderClock) -> Iterator[Batch]:
+        """Read the messages of the topics. The clock follows their times of recording."""
 
     def note(self, line: str) -> None:
         """Note damage."""
@@ -232,14 +234,6 @@ class BagFile(ABC):
     def state(self, fact: str) -> None:
         """Note a fact that readers must know."""
         self._damage.state(f"{self.path.name}: {fact}")
-
-    def state_set_back(self, clock: RecorderClock) -> None:
-        """Note that the clock of the recorder was set back."""
-        if clock.set_back:
-            self.state(
-                f"the clock of the recorder was set back by {figures(clock.set_back * 1e-9)} s:"
-                " the messages were taken in the order in which they were written"
-            )
 
     def leave_out(self, names: str, why: str) -> None:
         """Note gyros that cannot be read as such."""
@@ -320,7 +314,7 @@ def _pieces_of_one(folder: Path) -> list[Path]:
         if child.is_file() and child.name.endswith(SUFFIXES)
     ]
     paths.sort(key=lambda child: natural_order(child.name))
-    stems = {re.sub(r"[_-]?[0-9]*$", "", path.name.partition(".")[0]) for path in paths}
+    stems = {name_of_recording(path) for path in paths}
     others = [
         child
         for child in folder.iterdir()
@@ -335,6 +329,11 @@ def _pieces_of_one(folder: Path) -> list[Path]:
             " on the folder"
         )
     return paths
+
+
+def name_of_recording(path: Path) -> str:
+    """Return the name of a file without its suffixes and its number in the recording."""
+    return re.sub(r"[_-]?[0-9]*$", "", path.name.partition(".")[0])
 
 
 def tables_of(folder: Path) -> tuple[Path, ...]:

@@ -12,6 +12,7 @@ import contextlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import zstandard
@@ -30,8 +31,11 @@ from fdi_ros.bag.raw import (
     LogText,
     Topic,
     find_files,
+    name_of_recording,
+    natural_order,
     tables_of,
 )
+from fdi_ros.bag.recorder_clock import LEAST_SET_BACK, RecorderClock
 from fdi_ros.bag.ros1_file import Ros1File
 from fdi_ros.bag.sqlite_file import SqliteFile
 from fdi_ros.bag.tlog import Tlog
@@ -46,7 +50,7 @@ from fdi_ros.system.files import (
     open_regular,
     scratch_folder,
 )
-from fdi_ros.system.text import did_you_mean, shown
+from fdi_ros.system.text import did_you_mean, figures, shown
 
 FORMATS: dict[str, type[BagFile]] = {
     ".mcap": McapFile,
@@ -62,11 +66,19 @@ FORMATS: dict[str, type[BagFile]] = {
 """By the suffix of a file, in small letters."""
 
 
+def _number_in_recording(file: BagFile) -> list[int | str]:
+    """Return a key by which the files of one recorder sort in the order of writing."""
+    return natural_order(file.path.name)
+
+
 class _FileWalk:
     """The batches of one file, and how far they have come."""
 
-    def __init__(self, file: BagFile, topics: Sequence[str]) -> None:
-        self._batches = file.batches(topics)
+    def __init__(
+        self, file: BagFile, topics: Sequence[str], clock: RecorderClock
+    ) -> None:
+        self._batches = file.batches(topics, clock)
+        self.clock = clock
         self.horizon = file.start_time  #: no later batch has an earlier message, ns
         self.progress = 0.0  #: share of the file read so far
         self.done = False
@@ -102,7 +114,12 @@ class Recording:
         except BaseException:  # Close the files whatever ends the opening.
             self.close()
             raise
-        self._files.sort(key=lambda file: file.start_time)
+        #: whether one recorder wrote the files one after the other
+        self._is_split = self._is_one_recording()
+        if self._is_split and self._clock_was_set():
+            self._files.sort(key=_number_in_recording)
+        else:
+            self._files.sort(key=lambda file: file.start_time)
 
     def __enter__(self) -> Recording:
         return self
@@ -182,12 +199,25 @@ class Recording:
         """Read the messages of topics, all files in the order of time."""
         there = {topic.name for topic in self.topics}
         topics = [name if name in there else f"/{name}" for name in names]
-        walks = [_FileWalk(file, topics) for file in self._files]
-        # The file that is farthest behind is read on: those of one time are read together.
+        of_recorder = RecorderClock()
+        walks = [
+            _FileWalk(file, topics, of_recorder if self._is_split else RecorderClock())
+            for file in self._files
+        ]
         while going := [walk for walk in walks if not walk.done]:
-            batch = min(going, key=lambda walk: walk.horizon).take()
+            # Files of one time are read together: the one that is farthest behind goes on.
+            walk = (
+                going[0] if self._is_split else min(going, key=lambda one: one.horizon)
+            )
+            batch = walk.take()
             if batch is None:
+                walk.clock.begin_file()
                 continue
+            if back := walk.clock.set_back:
+                self.damage.state(
+                    f"the clock of the recorder was set back by {figures(back * 1e-9)} s:"
+                    " the messages were taken in the order in which they were written"
+                )
             batch = replace(
                 batch,
                 progress=sum(walk.progress for walk in walks) / len(walks),
@@ -200,6 +230,22 @@ class Recording:
                 )
                 batch = batch.at(possible)
             yield batch
+
+    def _is_one_recording(self) -> bool:
+        """Whether the files are those that one recorder of ROS 2 begins one after the other."""
+        of_ros2 = all(isinstance(one, (McapFile, SqliteFile)) for one in self._files)
+        return (
+            of_ros2 and len({name_of_recording(one.path) for one in self._files}) == 1
+        )
+
+    def _clock_was_set(self) -> bool:
+        """Whether a file begins before the end of one with a lower number, and both have some time in common."""
+        numbered = sorted(self._files, key=_number_in_recording)
+        return any(
+            after.start_time <= before.end_time - LEAST_SET_BACK
+            and before.start_time <= after.end_time
+            for before, after in combinations(numbered, 2)
+        )
 
     def _open_all(self, paths: Sequence[Path]) -> None:
         """Open the files. A folder of tables holds one IMU in each.

@@ -24,7 +24,7 @@ class RecorderClock:
     """Times of recording that go on where the clock of the recorder was set back."""
 
     def __init__(self) -> None:
-        self._first: dict[int, int] = {}  # first time of each topic, ns
+        self._first: dict[int, int] = {}  # first time of each topic in a file, ns
         self._last: dict[int, int] = {}  # last time of each topic, ns
         self._shift: dict[int, int] = {}  # added to the times of each topic, ns
         #: longest step back so far, ns
@@ -35,11 +35,15 @@ class RecorderClock:
         """Smallest time added to those of a topic, ns."""
         return min(self._shift.values(), default=0)
 
+    def begin_file(self) -> None:
+        """Take a step back to any time for that of a clock: a further file of the recorder begins."""
+        self._first.clear()
+
     def follow(self, topic: Int, time: Int) -> Int:
         """Return times (k,), ns, that go on where those of a topic step back.
 
         ``topic``, ``time``: (k,) of further messages, in the order in which they were written.
-        A step to before the first message is none: parts of a file may be in any order.
+        A step to before the first message of a file is none: its parts may be in any order.
         """
         followed = time.copy()
         # A topic that begins later has the clock of the others.

@@ -58,13 +58,16 @@ class SqliteFile(LibraryBag):
             self._base = self._opened()
             self._check_tables()
             self._numbered = self._topics()
-            start = next(self._query("SELECT MIN(timestamp) FROM messages"))[0]
+            start, end = next(
+                self._query("SELECT MIN(timestamp), MAX(timestamp) FROM messages")
+            )
         except BaseException as error:  # Close the file whatever ends the opening.
             self.close()
             if isinstance(error, (sqlite3.Error, OSError)):
                 raise BagError(f"{path} {self.refusal}: {error}") from error
             raise
         self.start_time = start if isinstance(start, int) else NO_HORIZON
+        self.end_time = end if isinstance(end, int) else 0
         try:
             counts = dict(
                 self._query("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id")

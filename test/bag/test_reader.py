@@ -411,21 +411,40 @@ def test_an_index_without_end_is_refused(tmp_path, monkeypatch):
         Recording(path)
 
 
-@pytest.mark.parametrize("make", ["zstd chunks", "rosbag2 sqlite3", "ros 1"])
-@pytest.mark.parametrize("all_clocks", [False, True])
-def test_messages_after_a_clock_was_set_back_follow_those_before(
-    make, all_clocks, tmp_path
-):
-    """Sorted by time, those of two times would be mixed, and equal stamps be lost."""
+def set_back(at, stamped=False):
+    """Messages before and after the clock was set back by 1.2 s at a sample, and their values.
+
+    ``stamped``: by this clock, too.
+    """
     z = np.random.default_rng(0).normal(size=(SAMPLES, 6))
-    set_back = STAMP.copy()
-    set_back[SAMPLES // 2 :] -= 120 * STEP
-    stamps = set_back if all_clocks else STAMP
+    recorded = STAMP.copy()
+    recorded[at:] -= 120 * STEP
+    stamps = recorded if stamped else STAMP
     messages = [
-        (topic, at + 1000 * k, imu(stamp, row[3 * k : 3 * k + 3]))
-        for at, stamp, row in zip(set_back.tolist(), stamps.tolist(), z, strict=True)
+        (topic, time + 1000 * k, imu(stamp, row[3 * k : 3 * k + 3]))
+        for time, stamp, row in zip(recorded.tolist(), stamps.tolist(), z, strict=True)
         for k, topic in enumerate(TOPICS)
     ]
+    return messages, z
+
+
+# Third parts of the messages are the files of a split recording.
+@pytest.mark.parametrize(
+    ("make", "at"),
+    [
+        ("zstd chunks", SAMPLES // 2),
+        ("rosbag2 sqlite3", SAMPLES // 2),
+        ("ros 1", SAMPLES // 2),
+        ("three mcap files", 2 * SAMPLES // 3),
+        ("three sqlite3 files", 2 * SAMPLES // 3),
+    ],
+)
+@pytest.mark.parametrize("all_clocks", [False, True])
+def test_messages_after_a_clock_was_set_back_follow_those_before(
+    make, at, all_clocks, tmp_path
+):
+    """Sorted by time, those of two times would be mixed, and equal stamps be lost."""
+    messages, z = set_back(at, all_clocks)
     path = MAKES[make](tmp_path / "bag", messages)
     stamp, values, samples = read(path)
     # One value is lost where the samples begin anew.
