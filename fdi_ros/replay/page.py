@@ -541,9 +541,7 @@ def _channel_section(summary: Summary, unit: Unit) -> Section:
         ),
         "noise, noise_std": lambda one: number(one.noise, ".2g"),
         "spikes": lambda one: str(one.spikes),
-        f"bias followed, {unit.name}": lambda one: figure(
-            one, one.bias_followed, "+.2g"
-        ),
+        f"bias moved, {unit.name}": lambda one: figure(one, one.drift, "+.2g"),
     }
     return Section(
         "Channels",

@@ -358,7 +358,6 @@ class Judge(Walk):
                 since_s=since,
                 reason=reason,
                 drift=status.drift_since_rest(one),
-                bias_followed=one.drift,
                 noise=one.noise or None,
                 unchecked=unchecked,
             )

@@ -43,8 +43,6 @@ class ChannelResult(ChannelHealth):
     """Time at which it came into the state, s from the first message. None: from the start."""
     reason: str
     """Reason for the state. Empty: none."""
-    bias_followed: float
-    """Drift of its bias against the other channels since the start, rad/s."""
     residual_rms_rad_s: float | None
     """Root mean square of its difference from the fused rate while it was OK, rad/s.
     None: never OK."""

@@ -68,7 +68,16 @@ from fdi_ros.setup.run import (
     Tried,
     times_words,
 )
-from fdi_ros.system.text import LINE, figures, first_of, listed, percent, shown, span
+from fdi_ros.system.text import (
+    LINE,
+    figures,
+    first_of,
+    listed,
+    percent,
+    plus_minus,
+    shown,
+    span,
+)
 
 #: uncertainty of the axes along a direction of the body from which they are not well
 #: shown
@@ -150,9 +159,9 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
     yield Finding(Role.FOUND, "scale error", words, (), *result.scale)
     bent = found.nonlinearity
     if bent.is_measured:
-        size = f"{100 * bent.value:.2g} +- {100 * bent.error:.1g} %"
+        size = _percent(bent.value, bent.error)
         if abs(bent.value) < bent.error:
-            size = f"too small to measure, below {100 * bent.error:.1g} %"
+            size = f"too small to measure, below {_percent(bent.error)}"
         words = f"nonlinearity {size} of the largest rate"
         yield Finding(Role.FOUND, "nonlinearity", words, (), bent.value, bent.error)
     for delay in result.delays:
@@ -167,6 +176,13 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
             delay.error,
             SHOWN_ERRORS * delay.error,
         )
+
+
+def _percent(value: float, error: float = 0.0) -> str:
+    """Return a relative error in percent, with its standard error if there is one: ``0.42 +- 0.03 %``."""
+    in_percent = 100.0 * value
+    words = plus_minus(in_percent, 100.0 * error) if error else figures(in_percent, 2)
+    return f"{words} %"
 
 
 def _quietest(share: float) -> str:
@@ -259,7 +275,7 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
         )
     if poor := [a for a in range(3) if SHOWN_AXES < error[a] <= UNMEASURED]:
         turns = ", ".join(
-            f"{'xyz'[a]} ({rms[a]:.2g} {unit.name} rms, axes +-{100 * error[a]:.1f} %)"
+            f"{'xyz'[a]} ({rms[a]:.2g} {unit.name} rms, axes +-{_percent(error[a])})"
             for a in poor
         )
         words = f"axes: too little rotation about {turns} of {body_frame}; the result stays near the configured axes."
@@ -324,7 +340,7 @@ def _found_forces(fit: AccelerometerFit) -> Iterator[Finding]:
         )
     yield Finding(Role.FOUND, "accelerometer bias", words)
     words = "accelerometers: after correction their scales still differ by"
-    words += f" {100 * fit.scale[0]:.2g} +- {100 * fit.scale[1]:.1g} %"
+    words += f" {_percent(*fit.scale)}"
     yield Finding(Role.FOUND, "accelerometer scale error", words, (), *fit.scale)
 
 
@@ -490,8 +506,8 @@ def _bounds(result: Calibration, unit: Unit) -> list[_Bound]:
             "scale factors differ from nominal",
             result.factor - 1.0,
             LARGE_SCALE,
-            "{:+.1%}",
-            1.0,
+            "{:+.1f} %",
+            100.0,
         ),
         _Bound(
             "biases moved within the recording", swing, LARGE_SWING, rate, unit.factor
