@@ -41,6 +41,7 @@ from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.estimator.rest import rests
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
+from fdi_ros.monitor.building import GUARD
 from fdi_ros.monitor.receiver import warm_detector, warm_path
 from fdi_ros.report.layout import unit_of
 from fdi_ros.setup.mounting import (
@@ -189,10 +190,12 @@ def compile_now(names: Sequence[str] = tuple(DETECTORS)) -> int:
 
     Return the number of functions that were compiled.
     """
-    # The longest part comes first. Blocks and messages share code, so they are one part.
+    # The longest part comes first. Blocks and messages share code, so they are one part. Every monitor has the
+    # guard: another process would compile it once more at the same time.
+    others = [name for name in reversed(names) if name != GUARD]
     parts: list[tuple[Any, ...]] = [
         (warm_path,),
-        *((warm_detector, name) for name in reversed(names)),
+        *((warm_detector, name) for name in others),
         (warm_verbs,),
     ]
     # Forking a process with threads can hang.

@@ -23,10 +23,12 @@ from bag import logs
 from fdi_ros.cli import command_line
 from fdi_ros.cli.command_line import main
 from fdi_ros.cli.outputs import progress
+from fdi_ros.cli.settings import compile_now, warm_detector, warm_path
 from fdi_ros.config.config import Config
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.inspection.fitness import not_configured
+from fdi_ros.monitor.building import GUARD
 from fdi_ros.signals import STOPPING
 from fdi_ros.system import shipped_files
 
@@ -339,17 +341,44 @@ def test_compile_leaves_nothing_to_compile(fdi, refused):
     refused("compile", "--detector", "magic")
 
 
+def test_no_two_processes_compile_the_same(monkeypatch):
+    """Every monitor has the guard, which is compiled with what takes samples through it."""
+    handed_out = []
+
+    class Pool:
+        def __init__(self, *_):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def map(self, work, parts):
+            handed_out.extend(parts)
+            return [0 for _ in parts]
+
+    monkeypatch.setattr("fdi_ros.cli.settings.ProcessPoolExecutor", Pool)
+    compile_now([GUARD, "cusum"])
+    detectors = [part[1:] for part in handed_out if part[0] is warm_detector]
+    assert detectors == [("cusum",)]
+    assert (warm_path,) in handed_out
+
+
 NEW_FORMS = """
 import sys
 from fdi_ros.cli.command_line import main
 from fdi_ros.cli.settings import warm_path, warm_verbs
 from fdi_ros.compiling import compiled
 from fdi_ros.detectors import DETECTORS
+from fdi_ros.monitor.building import GUARD
 from fdi_ros.monitor.receiver import warm_detector
 
 warm_path()
 for name in DETECTORS:
-    warm_detector(name)
+    if name != GUARD:
+        warm_detector(name)
 warm_verbs()
 forms = lambda: {(one.py_func.__qualname__, form) for one in compiled._dispatchers for form in one.signatures}
 before = forms()
