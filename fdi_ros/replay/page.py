@@ -207,8 +207,8 @@ class Curves:
         return [
             Section(
                 words.fused,
-                f"Band: two standard deviations. What each channel makes of an axis: the"
-                f" {words.vector} moved along the channel's own axis until it agrees.",
+                f"Band: two standard deviations. The line of a channel is the {words.vector},"
+                " moved along the axis of that channel to what the channel measures.",
                 "",
                 [self._rate(k, {**scale, **common}) for k in range(len(_AXES))],
             ),
