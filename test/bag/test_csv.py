@@ -323,6 +323,6 @@ def test_verbs_read_a_table_and_a_fleet_passes_others_by(tmp_path, fdi):
     config = tmp_path / "made.yaml"
     assert "/imu_1" in fdi("inspect", path, "--output", config).out
     assert fdi("replay", path, "--config", config, "--check", "declared=0").code == 0
-    said = fdi("fleet", tmp_path, "--output", tmp_path / "fleet")
+    said = fdi("fleet", tmp_path, "--output", tmp_path / "fleet", "--workers", 1)
     assert said.code == 0, said.err
     assert "other.csv" not in said.out

@@ -187,7 +187,7 @@ def test_of_several_configs_the_later_wins_and_shipped_ones_go_by_name(
         "sweep": ("--fault", "kind=bias size=0.1", "--times", 1, "--end", 30),
         "calibrate": ("--output", "new.yaml", "--end", 40),
         "geometry": (),
-        "fleet": ("--output", "fleet"),
+        "fleet": ("--output", "fleet", "--workers", 1),
     }[verb]
 
     def called(*files):

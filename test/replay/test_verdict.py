@@ -274,7 +274,7 @@ def test_one_noise_of_a_loose_unit_whoever_is_asked(fdi, tmp_path):
         fdi("replay", loose).out,
         fdi("setup", loose, "--output", made).out,
         fdi("replay", loose, "--config", made).out,
-        fdi("fleet", loose, "--output", tmp_path / "fleet").out,
+        fdi("fleet", loose, "--output", tmp_path / "fleet", "--workers", 1).out,
     ]
     words = r"imu_1 had up to (\d+) times the noise of the other units"
     ratios = [int(one) for out in outputs for one in re.findall(words, out)]
