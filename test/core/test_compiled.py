@@ -356,7 +356,7 @@ def test_a_verb_says_it_before_its_result(tmp_path, root, flight):
         "NUMBA_CACHE_DIR": str(tmp_path),
         "NUMBA_BOUNDSCHECK": "1",
     }
-    for said, output in ((COMPILING, "first"), ("", "later")):
+    for said, output in (([COMPILING], "first"), ([], "later")):
         done = subprocess.run(
             [*command, "--output", str(tmp_path / output)],
             capture_output=True,
@@ -366,8 +366,13 @@ def test_a_verb_says_it_before_its_result(tmp_path, root, flight):
             env=environment,
         )
         assert done.returncode == 0
-        first, _, rest = done.stderr.partition("\n")
-        assert first == said
-        assert all(re.fullmatch(PROGRESS, line) for line in rest.splitlines())
+        # On a busy machine the verb says how far it is.
+        lines = [
+            line
+            for line in done.stderr.splitlines()
+            if not re.search("% done|so far", line)
+        ]
+        assert lines[:1] == said
+        assert all(re.fullmatch(PROGRESS, line) for line in lines[1:])
         assert done.stdout.endswith(f"wrote {tmp_path / output}\n")
         assert [*tmp_path.rglob("*.nbi")], "kept in the folder that the user wishes"
