@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 ROOT = Path(__file__).parents[1]
 #: Files whose tests mostly wait for processes that they start, the longest first.
@@ -71,7 +71,14 @@ os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="fdi_ros_log_")
 
 # The same examples in every run: a failure of the suite is one that the next run shows again.
-settings.register_profile("suite", deadline=None, derandomize=True, max_examples=50)
+settings.register_profile(
+    "suite",
+    deadline=None,
+    derandomize=True,
+    max_examples=50,
+    # A deadline by another name: the first examples may take no longer than 30 s.
+    suppress_health_check=[HealthCheck.too_slow],
+)
 settings.load_profile("suite")
 
 
