@@ -232,11 +232,20 @@ class Recording:
             yield batch
 
     def _is_one_recording(self) -> bool:
-        """Whether the files are those that one recorder of ROS 2 begins one after the other."""
+        """Whether one recorder of ROS 2 wrote the files one after the other.
+
+        They have one name and numbers, and some gyros are in all that are not empty. Files of
+        several recorders at the same time have other topics each.
+        """
         of_ros2 = all(isinstance(one, (McapFile, SqliteFile)) for one in self._files)
-        return (
-            of_ros2 and len({name_of_recording(one.path) for one in self._files}) == 1
-        )
+        names = {name_of_recording(one.path) for one in self._files}
+        gyros = [
+            {one.name for one in file.topics if source_of_type(one.type) is not None}
+            for file in self._files
+            if file.end_time
+        ]
+        shared = set.intersection(*gyros) if gyros else set()
+        return of_ros2 and len(names) == 1 and bool(shared)
 
     def _clock_was_set(self) -> bool:
         """Whether a file begins before the end of one with a lower number, and both have some time in common."""

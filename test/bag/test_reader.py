@@ -461,6 +461,22 @@ def test_messages_after_a_clock_was_set_back_follow_those_before(
     np.testing.assert_array_equal(values, expected)
 
 
+def test_files_of_several_recorders_are_read_together(tmp_path):
+    """One after the other, all messages of the first would wait in memory for those of the second."""
+    messages, z = flight(SAMPLES)
+    (folder := tmp_path / "bag").mkdir()
+    for k, topic in enumerate(TOPICS):
+        of_topic = [message for message in messages if message[0] == topic]
+        write_mcap(folder / f"imu_{k}.mcap", of_topic)
+    stamp, values, samples = read(folder)
+    np.testing.assert_array_equal(stamp, STAMP)
+    np.testing.assert_array_equal(values, z)
+    assert samples.recording.damage.facts == []
+    with Recording(folder) as recording:
+        first, second, *_ = recording.batches(TOPICS)
+    assert (set(first.topic), set(second.topic)) == ({0}, {1})
+
+
 @pytest.mark.parametrize("make", ["zstd chunks", "rosbag2 sqlite3", "ros 1"])
 def test_parts_of_a_file_may_be_in_any_order(make, tmp_path):
     messages, z = flight(SAMPLES)
