@@ -245,7 +245,9 @@ def test_clocks_that_share_no_instants_are_named(ahead, tmp_path, fdi, refused):
     made = (tmp_path / "bag.mcap", "--output", tmp_path / "made.yaml")
     if not ahead:
         # One axis alone turns: a fault of 0.1 rad/s is not found in 9 of 10.
-        assert fdi("setup", *made)[::2] == (4, "")
+        code, _, said = fdi("setup", *made)
+        # On a slow machine, only how far it has come.
+        assert (code, "other clocks" in said) == (4, False)
         return
     assert words in refused("setup", *made)
     config = write_config(
