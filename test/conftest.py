@@ -177,9 +177,13 @@ def flight():
 
 
 @pytest.fixture
-def fdi(capsys):
-    """Run a command of `fdi` in this process."""
+def fdi(capsys, monkeypatch):
+    """Run a command of `fdi` in this process, which says nothing of its progress."""
+    from fdi_ros.cli import outputs
     from fdi_ros.cli.command_line import main
+
+    # On a busy machine there would be lines of it.
+    monkeypatch.setattr(outputs, "SAID_EVERY", 3600.0)
 
     def run(*words):
         return Said(main([str(word) for word in words]), *capsys.readouterr())
