@@ -457,7 +457,9 @@ class Failover:
 
     def _is_slow(self, view: View, now: int) -> bool:
         """Return whether an IMU in use comes so slowly that vibration may look like an error."""
-        vehicle = self._vehicle
-        tracks = (vehicle.units.get(k) for k, imu in enumerate(view.imus) if imu.use)
-        least = ENOUGH * vehicle.settings.rate
-        return any(track and track.rate(now) < least for track in tracks)
+        units = self._vehicle.units
+        least = ENOUGH * self._vehicle.settings.rate
+        return any(
+            imu.use and imu.delivers and units[k].rate(now) < least
+            for k, imu in enumerate(view.imus)
+        )

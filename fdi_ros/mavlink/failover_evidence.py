@@ -41,7 +41,8 @@ BREAK = 100 * MS  #: A shorter break ends no agreement, and no difference, ns.
 HEALED = NS // 2  #: Time of agreement after which an earlier size is forgotten, ns.
 SET_STANDS = 300 * MS  #: A set must stand for this time to name an IMU, ns,
 LONGEST_BREAK = 200 * MS  #: without a break longer than this, ns.
-#: Least error of the odd one in a set of several IMUs, or suspected, in ``min_size``.
+#: Least error of the odd one in a set of several IMUs, or suspected, and of one that is
+#: compared with only one other IMU, in ``min_size``.
 VOTE = 2.0
 SUSPECT_STANDS = NS  #: An IMU must be suspected, and the odd one, for this time, ns.
 #: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
@@ -82,6 +83,9 @@ UNJUDGED = {ChannelState.UNCHECKED, ChannelState.EXCLUDED, ChannelState.STALE}
 KNOWN_SIGMAS = 5.0  #: Standard deviations from which a size is known.
 SILENCE = NS // 2  #: An IMU without samples for this time does not deliver, ns.
 STATES_KNOWN_FOR = 5 * NS  #: Older states of the monitor are unknown, ns.
+#: An axis counts as judged for this time after the monitor last judged it, ns: it leaves all
+#: axes out for up to 0.5 s where a turn begins.
+JUDGED_FOR = NS
 
 AXES = "xyz"
 NOBODY: tuple[int, set[int], int] = (-1, set(), 0)
@@ -116,6 +120,7 @@ class Track:
 
     #: States of its three channels. Empty: unknown.
     states: tuple[ChannelState, ...] = ()
+    judged_at: list[int] = field(default_factory=lambda: [-NS] * 3)  #: Last, by axis.
     nearest: Vector = UNKNOWN_RATES  #: Difference to the nearest partner, rad/s.
     bound: float = math.nan  #: A bound on that, rad/s.
     sizes: Vector = UNKNOWN_RATES  #: Largest difference of late, by axis, rad/s.
@@ -163,10 +168,7 @@ class Track:
 
 def _nearest(found: Sequence[Vector]) -> Vector:
     """Return the smallest of the differences of an IMU to its partners."""
-    # One difference that is unknown may be the one in which the IMU agrees.
-    if not found or any(map(math.isnan, map(max, found))):
-        return UNKNOWN_RATES
-    return min(found, key=max)
+    return min(found, key=max, default=UNKNOWN_RATES)
 
 
 def _note_sizes(track: Track, agreed: int | None, held: float, now: int) -> None:
@@ -270,6 +272,8 @@ class Evidence:
         found = [ChannelState(int(state)) for state in states]
         for k, track in enumerate(self._tracks):
             track.states = tuple(found[3 * k : 3 * k + 3])
+            for axis in track.axes(*set(ChannelState) - UNJUDGED):
+                track.judged_at[axis] = now
 
     def look(
         self,
@@ -303,14 +307,16 @@ class Evidence:
         self._compare(units, now)
         self._note_trust(units, now)
         odd, accused = self._lasting_odd_one(units, now)
-        partners = [
-            self._partners(k, units, out) if k in units else []
-            for k in range(len(delivers))
-        ]
+        partners: list[list[int]] = []
+        witnesses: list[int | None] = []
+        for k in range(len(delivers)):
+            found, witness = self._partners(k, units, out) if k in units else ([], None)
+            partners.append(found)
+            witnesses.append(witness)
         for k, track in enumerate(self._tracks):
-            found = [self._pairs[k, j] for j in partners[k]]
-            track.nearest = _nearest([pair.apart for pair in found])
-            track.bound = max(_nearest([pair.bound for pair in found]))
+            pairs = [self._pairs[k, j] for j in partners[k]]
+            track.nearest = _nearest([pair.apart for pair in pairs])
+            track.bound = max(_nearest([pair.bound for pair in pairs]))
         elapsed = now - self._looked
         held = math.exp(-elapsed / NS / DECAY)
         self._looked = now
@@ -323,7 +329,7 @@ class Evidence:
             axes = faulty | accused if k == odd else faulty
             if track.outdated and not self._is_odd(k, units):
                 axes = axes - (track.outdated - self._axes_off_again(k, units, now))
-            blamed = any(track.sizes[axis] >= self._min_size for axis in axes)
+            blamed = self._is_blamed(track, axes, witnesses[k])
             if k in out or blamed:
                 self._note_wrong(track, partners[k], axes)
             elif agreed is not None and now - agreed >= HEALED:
@@ -342,7 +348,11 @@ class Evidence:
                     agreed=agreed,
                     votes=k not in self._once_bad,
                     waits="".join(AXES[axis] for axis in sorted(track.waits)),
-                    judged=any(state not in UNJUDGED for state in track.states),
+                    unjudged="".join(
+                        axis
+                        for axis, at in zip(AXES, track.judged_at, strict=True)
+                        if now - at >= JUDGED_FOR
+                    ),
                 )
             )
         self.imus = tuple(imus)
@@ -504,17 +514,38 @@ class Evidence:
 
     def _partners(
         self, unit: int, units: Sequence[int], out: Sequence[int]
-    ) -> list[int]:
+    ) -> tuple[list[int], int | None]:
         """Return the IMUs with which one is compared: in use or trusted, or else all.
 
-        One that is stuck is no measure. For one that is FAULTY, those are that the monitor
-        finds OK, if there are any: two that are FAULTY may be so alike.
+        One that is stuck, or with an unknown difference, is no measure. For one that is
+        FAULTY, those are that the monitor finds OK, if there are any: two that are FAULTY may
+        be so alike.
+
+        Also return the only IMU in use or trusted that is a measure, or None.
         """
         others = [k for k in units if k != unit and not self.raw.is_stuck(k)]
         fit = [k for k in others if k not in out or self._is_trusted(k)]
-        fine = [k for k in fit if self._tracks[k].is_ok]
+        apart = {k: max(self._pairs[unit, k].apart) for k in fit or others}
+        known = [k for k, size in apart.items() if not math.isnan(size)]
+        if not fit:
+            return known, None
+        fine = [k for k in known if self._tracks[k].is_ok]
         is_faulty = ChannelState.FAULTY in self._tracks[unit].states
-        return (is_faulty and fine) or fit or others
+        return (is_faulty and fine) or known, known[0] if len(known) == 1 else None
+
+    def _is_blamed(self, track: Track, axes: set[int], witness: int | None) -> bool:
+        """Return whether an IMU, named on these axes, is apart on one of them.
+
+        Of two IMUs either may be wrong, or both by less than ``min_size``. So the monitor must
+        not doubt that axis of the other one, and the difference must be `VOTE` times as large.
+
+        witness: the only IMU with which this one could be compared, or None.
+        """
+        least = self._min_size
+        if witness is not None:
+            axes = axes - self._tracks[witness].axes(*DOUBTS)
+            least *= VOTE
+        return any(track.sizes[axis] >= least for axis in axes)
 
     def _is_trusted(self, unit: int) -> bool:
         return self._tracks[unit].refuted is not None

@@ -10,11 +10,13 @@ clock and no link. An order sets INS_USEk. `failover_words` has the texts for th
 
 Definitions
     apart    raw rate differs by ``min_size`` or more, and more than scales explain, from
-             the nearest IMU that is in use or trusted
+             the nearest IMU that is in use or trusted. The errors of both may add up
     named    by the monitor, now or in its last report if that is not old, or by the raw
              rates: two of three IMUs agree, and the third is far off
-    blamed   named on an axis that is apart. A name from before the IMU last agreed counts
-             only while two of three IMUs agree, and this one does not
+    blamed   named on an axis that is apart. If only one other IMU can be compared: by twice
+             as much, and the monitor does not doubt that axis of the other one. A name from
+             before the IMU last agreed counts only while two of three IMUs agree, and this
+             one does not
     bad      blamed, and delivers. Else left in use.
     alive    delivers samples, and they change while other IMUs turn
     sound    alive, and the monitor finds it OK or it is not apart
@@ -36,7 +38,7 @@ Rules, in this order at each tick
        at once that the monitor finds OK, or soon if it is off by a `LESSER`-th. On the
        ground the IMU stays out until the monitor finds it OK. An IMU that was out when the
        autopilot started has no notch filters: only the operator or rule 4 puts it back.
-    2. In flight, the worst bad IMU to which `objection` has nothing becomes held. At
+    2. In flight (`View.armed`), the worst bad IMU to which `objection` has nothing becomes held. At
        most ``limit`` IMUs are ours, without a limit all but one. Of two IMUs, one that has
        not agreed in a turn since it was bad is no reserve.
     3. Orders are sent until the autopilot reports the wanted state. An order to take an
@@ -86,7 +88,7 @@ class PolicySettings(NamedTuple):
     """Settings of failover."""
 
     limit: int = 0  #: Most IMUs out of use by our orders. 0: all but one.
-    min_size: float = 0.03  #: Smallest error that is acted on, rad/s.
+    min_size: float = 0.03  #: Smallest difference of two IMUs that is acted on, rad/s.
 
 
 class Imu(NamedTuple):
@@ -99,7 +101,9 @@ class Imu(NamedTuple):
     ok: bool = False  #: The monitor finds all its channels OK.
     delivers: bool = False  #: Its samples arrive.
     stuck: bool = False  #: They repeat one value while another IMU moves.
-    judged: bool = True  #: The monitor judges at least one of its channels.
+    unjudged: str = (
+        ""  #: Axes, such as xz, that the monitor has not judged for a while.
+    )
     lane: bool = True  #: The autopilot has an EKF lane for it, as far as is known.
     size: float = float("nan")
     """Largest raw difference to the nearest IMU of late, rad/s. NaN: unknown."""
@@ -119,7 +123,7 @@ class View(NamedTuple):
 
     imus: tuple[Imu, ...]
     linked: bool = False  #: An ArduPilot that sends SCALED_IMU is heard.
-    armed: bool = False
+    armed: bool = False  #: By the last heartbeat, which may be 1 s old.
     disarmed: int = 0  #: How long all heartbeats have reported "disarmed".
     monitored: bool = False  #: The right monitor is alive and has no imitator.
     boots: int = 0  #: Number of starts of the autopilot seen.

@@ -42,7 +42,7 @@ MONITOR_LATE = "the monitor is late"
 NO_OTHER = "no other IMU can go out of use"
 #: By whether the autopilot sets a parameter, as far as is known.
 ORDER_WORDS = {
-    False: "the autopilot refuses {}",
+    False: "setting {} has no effect",
     None: "setting {} is not answered",
 }
 
@@ -117,6 +117,10 @@ def _reasons(
     settings: PolicySettings,
 ) -> Iterator[str]:
     view = _without_late_answers(memories, view, now)
+    apart = [str(k + 1) for k, imu in enumerate(view.imus) if is_apart(imu, settings)]
+    # Of two that differ from each other, either may be the bad one.
+    differ = f"IMUs {', '.join(apart)} differ" if len(apart) > 1 else ""
+    found = []
     for k, (memory, imu) in enumerate(zip(memories, view.imus, strict=True)):
         name = f"IMU {k + 1}"
         checks = (
@@ -125,14 +129,17 @@ def _reasons(
             (imu.use is False, f"{name} not in use"),
             (memory.left_alone, f"{name} left alone in this flight"),
             (imu.blamed, f"{name} faulty and in use"),
-            (is_apart(imu, settings), f"{name} differs and is in use"),
+            (is_apart(imu, settings), differ or f"{name} differs and is in use"),
             (not imu.delivers, f"{name} sends nothing"),
             (not memory.acquainted, f"{name} not seen to agree yet"),
             (imu.agreed is None, f"{name} agrees with none"),
-            (not imu.judged, f"{name} is not judged"),
+            (imu.unjudged, f"{name} {', '.join(imu.unjudged)} not judged"),
             (not imu.lane, f"{EKF_LANES} is without {name}"),
         )
-        yield from (words for holds, words in checks if holds)
+        found.append(checks)
+    # The gravest reason of any IMU first.
+    for same in zip(*found, strict=True):
+        yield from (words for holds, words in same if holds)
     orders = zip(INS_USE, facts.obeys, strict=False)
     yield from (ORDER_WORDS[obeys].format(name) for name, obeys in orders if not obeys)
     whole = (

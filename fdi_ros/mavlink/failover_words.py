@@ -78,7 +78,7 @@ class Condition(Enum):
     STAYS_OUT = Words(CRITICAL, "still faulty, stays out of use")
     FROZEN = Words(WARNING, "repeats one value, stays out")
     NOT_OK = Words(WARNING, "stays out, monitor does not find it OK")
-    WAITS = Words(WARNING, "waits for a turn about {axes}")
+    WAITS = Words(WARNING, "waits to agree in a turn about {axes}")
     OUT = Words(CRITICAL, "out of use", urgent=True)
     LEFT_ALONE = Words(WARNING, "left alone in this flight")
     UNUSED = Words(WARNING, "not in use, not by failover")

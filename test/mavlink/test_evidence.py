@@ -21,7 +21,9 @@ NS = 1000 * MS
 STEP = 20 * MS
 NINE = 9 * MS  #: Interval of the messages of a link at 50 Hz.
 START = 1000 * NS
-OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED = map(int, list(ChannelState)[:6])
+OK, SUSPECT, AMBIGUOUS, FAULTY, STALE, UNCHECKED, EXCLUDED = map(
+    int, list(ChannelState)[:7]
+)
 
 #: Rates of one IMU in rad/s, given those of the vehicle.
 Gyro = Callable[[np.ndarray], Sequence[float]]
@@ -52,6 +54,8 @@ class Watched:
         self.states = [OK] * 3 * count
         self.out: list[int] = []
         self.taken: list[int] = []
+        #: IMUs of which nine of ten samples are missing, so that no difference is known.
+        self.slow: list[int] = []
         self.is_reporting = True
         self.now = START
         self.random = np.random.default_rng(1)
@@ -71,6 +75,8 @@ class Watched:
         self.now = START + int(self.t * 1000.0 + 1e-6) * MS
         rate = self.rate(self.t)
         for unit, gyro in enumerate(self.gyros):
+            if unit in self.slow and self.sent // self.interval % 10:
+                continue
             noisy = rate + self.random.normal(0.0, 0.002, 3)
             x, y, z = (round(value, 3) for value in map(float, gyro(noisy)))
             self.evidence.raw.feed(unit, self.now, (x, y, z))
@@ -306,6 +312,61 @@ def test_a_set_of_several_imus_without_an_odd_one_names_nobody() -> None:
     watched.gyros[2] = biased(0.1)
     watched.states[1::3] = [AMBIGUOUS] * 3
     assert not watched.blamed(3.0), "a set of another axis"
+
+
+@pytest.mark.parametrize("state", [UNCHECKED, EXCLUDED])
+def test_an_axis_that_the_monitor_leaves_out_for_long_is_not_judged(state: int) -> None:
+    """Where a turn begins, all axes are left out for a moment."""
+    watched = watch()
+    assert not any(imu.unjudged for imu in watched.step())
+    watched.states[4] = state
+    assert not any(imu.unjudged for imu in watched.run(0.9).step())
+    assert [imu.unjudged for imu in watched.run(0.2).step()] == ["", "y", ""]
+    watched.states[4] = OK
+    assert not any(imu.unjudged for imu in watched.step())
+
+
+def test_what_was_never_judged_is_not_judged() -> None:
+    never = Evidence(3, STEP, min_size=0.03)
+    assert [imu.unjudged for imu in never.look([True] * 3, [], START)] == ["xyz"] * 3
+
+
+# Compared with one other alone ---------------------------------------------------------------
+
+
+def test_an_imu_that_comes_too_slowly_hides_no_error_of_another() -> None:
+    """Another station has slowed it down. The two others can still be compared."""
+    watched = watch()
+    watched.slow = [2]
+    watched.run(1.0)
+    watched.gyros[1] = biased(0.3)
+    watched.states[3] = FAULTY
+    assert watched.blamed(1.0) == {1}
+
+
+@pytest.mark.parametrize(
+    ("size", "of_other", "state", "is_blamed"),
+    [
+        (0.025, -0.02, OK, False),
+        (0.025, -0.3, AMBIGUOUS, False),
+        (0.025, -0.3, SUSPECT, False),
+        (0.1, 0.0, OK, True),
+        (0.1, 0.0, UNCHECKED, True),
+    ],
+)
+def test_of_two_that_differ_the_named_one_is_blamed_only_if_the_other_is_sound(
+    size: float, of_other: float, state: int, is_blamed: bool
+) -> None:
+    """The third is out. Two harmless errors add up, and the one not named may be the worse."""
+    watched = watch()
+    watched.rate = lambda t: 0.1 * np.array([math.sin(2.1 * t), math.cos(t), 0.5])
+    watched.gyros[2] = biased(0.3)
+    watched.states[6] = FAULTY
+    watched.out = [2]
+    watched.run(1.0)
+    watched.gyros[:2] = [biased(size, axis=2), biased(of_other, axis=2)]
+    watched.states[2], watched.states[5] = FAULTY, state
+    assert (0 in watched.blamed(2.0)) == is_blamed
 
 
 # What is no steady error ------------------------------------------------------------------

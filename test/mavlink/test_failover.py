@@ -948,9 +948,9 @@ def test_a_frozen_imu_is_out_where_two_others_agree(moving: Moving, state: int) 
 
 
 def test_a_lesser_error_is_better_than_none_sound(flying: Monitored) -> None:
-    """Two are out for 0.07 rad/s each, then the last one is off by 1 rad/s."""
+    """Two are out for 0.07 and 0.1 rad/s, then the last one is off by 1 rad/s."""
     flying.fault(1, 0.07, seconds=4.0)
-    flying.fault(2, -0.07, seconds=4.0)
+    flying.fault(2, -0.1, seconds=4.0)
     assert flying.in_use == [False, False, True]
     flying.fault(3, 1.0, seconds=3.0)
     assert flying.in_use == [True, True, True]
@@ -1012,7 +1012,7 @@ def test_after_landing_an_imu_stays_out_until_it_has_agreed_while_turning(
     autopilot.armed = False
     flying.heal(2, 20.0)
     assert flying.in_use == [True, False, True]
-    assert flying.texts[-1] == "IMU 2 waits for a turn about x, y, z"
+    assert flying.texts[-1] == "IMU 2 waits to agree in a turn about x, y, z"
     assert "out of use: IMU 2" in flying.failover.status(flying.now)[1]
     assert flying.failover.is_done, "nothing to wait for at a stop"
     autopilot.armed = True
@@ -1282,7 +1282,7 @@ def test_an_autopilot_that_refuses_orders_is_not_ready(tmp_path: Path) -> None:
     assert reason(talk) == "ready"
     autopilot.read_only.add("INS_USE2")
     autopilot.reboot(talk.now)
-    assert reason(talk.run(12.0)) == "no failover: the autopilot refuses INS_USE2"
+    assert reason(talk.run(12.0)) == "no failover: setting INS_USE2 has no effect"
     assert not autopilot.sets
     assert talk.in_use == [True] * 3
 
@@ -1292,7 +1292,7 @@ def test_an_order_that_was_refused_is_remembered(flying: Monitored) -> None:
     autopilot.read_only.add("INS_USE")
     flying.fault(1, 0.5, seconds=3.0).heal(1, 8.0)
     assert flying.in_use == [True] * 3
-    assert reason(flying) == "no failover: the autopilot refuses INS_USE"
+    assert reason(flying) == "no failover: setting INS_USE has no effect"
     assert flying.texts[-1] == reason(flying)
     autopilot.read_only.clear()
     assert flying.fault(1, 0.5, seconds=2.0).in_use == [False, True, True]
@@ -1301,14 +1301,25 @@ def test_an_order_that_was_refused_is_remembered(flying: Monitored) -> None:
 
 def test_what_cannot_be_seen_is_not_ready(flying: Monitored, tmp_path: Path) -> None:
     flying.states = [UNCHECKED] * 9
-    assert reason(flying.run(1.0)) == "no failover: IMU 1 is not judged"
+    assert reason(flying.run(2.0)) == "no failover: IMU 1 x, y, z not judged"
     flying.states = [OK] * 9
+    assert reason(flying.run(1.0)) == "ready"
+    flying.states[4] = UNCHECKED
+    assert reason(flying.run(2.0)) == "no failover: IMU 2 y not judged"
+    flying.states[4] = OK
     assert reason(flying.run(1.0)) == "ready"
     flying.latency = lambda: 600 * MS
     assert reason(flying.run(10.0)) == "no failover: link is slow"
     two = Monitored(tmp_path, Autopilot("ardupilot", units=2))
     two.autopilots[0].parameters.pop("INS_USE3")
     assert reason(two.run(15.0)) == "no failover: use of IMU 3 is not reported"
+
+
+def test_an_imu_that_sends_nothing_is_not_called_slow(flying: Monitored) -> None:
+    autopilot = flying.autopilots[0]
+    autopilot.refuses.add(116)
+    del autopilot.intervals[116]
+    assert reason(flying.run(4.0)) == "no failover: IMU 2 sends nothing"
 
 
 def test_an_imu_without_an_ekf_lane_is_not_ready(tmp_path: Path) -> None:
@@ -1406,7 +1417,7 @@ def test_failover_does_not_act_again_while_an_order_is_refused(
     talk = Monitored(tmp_path, autopilot, limit=limit).run(10.0)
     autopilot.armed = True
     talk.run(5.0)
-    assert talk.texts[-1] == "no failover: the autopilot refuses INS_USE2"
+    assert talk.texts[-1] == "no failover: setting INS_USE2 has no effect"
     talk.fault(2, 0.3, seconds=8.0)
     assert talk.in_use == [True] * 3
     assert "failover acts again" not in talk.texts

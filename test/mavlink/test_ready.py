@@ -62,7 +62,7 @@ def test_two_that_were_bad_have_no_vote_on_the_third() -> None:
         ({"facts": {"obeys": (True, None, True)}}, "setting INS_USE2 is not answered"),
         (
             {"facts": {"obeys": (True, False, None)}},
-            "the autopilot refuses INS_USE2",
+            "setting INS_USE2 has no effect",
         ),
         ({"linked": False}, "no ArduPilot that sends each IMU"),
         ({"monitored": False}, "monitor silent or not alone"),
@@ -71,6 +71,7 @@ def test_two_that_were_bad_have_no_vote_on_the_third() -> None:
         ({"second": {"agreed": None}}, "IMU 2 agrees with none"),
         ({"second": {"delivers": False}}, "IMU 2 sends nothing"),
         ({"second": {"size": 0.05}}, "IMU 2 differs and is in use"),
+        ({"second": {"unjudged": "xy"}}, "IMU 2 x, y not judged"),
         ({"second": {"lane": False}}, "EK3_IMU_MASK is without IMU 2"),
         ({"memory": {"acquainted": False}}, "IMU 2 not seen to agree yet"),
         ({"memory": {"left_alone": True}}, "IMU 2 left alone in this flight"),
@@ -78,6 +79,25 @@ def test_two_that_were_bad_have_no_vote_on_the_third() -> None:
 )
 def test_each_doubt_has_its_sentence(given: dict[str, Any], words: str) -> None:
     assert reason(**given) == words
+
+
+@pytest.mark.parametrize(
+    ("imus", "words"),
+    [
+        ({0: {"size": 0.3}, 1: {"size": 0.3}}, "IMUs 1, 2 differ"),
+        (
+            {0: {"size": 0.3}, 1: {"size": 0.3, "named": True, "blamed": True}},
+            "IMU 2 faulty and in use",
+        ),
+    ],
+)
+def test_no_healthy_imu_is_named_for_another(
+    imus: dict[int, dict[str, Any]], words: str
+) -> None:
+    memories = [Memory(seen=True, acquainted=True)] * 3
+    seen = tuple(GOOD._replace(**imus.get(k, {})) for k in range(3))
+    view = View(seen, linked=True, monitored=True)
+    assert not_ready(memories, view, FACTS, NOW, PolicySettings()) == words
 
 
 def test_a_late_answer_that_the_policy_ignores_changes_nothing() -> None:

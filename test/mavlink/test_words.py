@@ -299,6 +299,6 @@ def test_a_healed_imu_waits_in_flight_for_a_turn_and_is_announced_out_once() -> 
         said += [(k, condition) for key, condition in found if key == 0]
     assert said == [(0, Condition.OUT), (100, Condition.WAITS)]
     text = text_of(0, Condition.WAITS, ["imu_1.x"] * 9, waits="xz")
-    assert text == "FDI: IMU 1 waits for a turn about x, z"
+    assert text == "FDI: IMU 1 waits to agree in a turn about x, z"
     longest = text_of(2, Condition.WAITS, ["imu_3.x"] * 9, waits="xyz")
     assert len(longest) <= TEXT_LENGTH
