@@ -439,6 +439,7 @@ def fill_input(core: Core, out: int) -> None:
     core.sample.mask = now.usable
     for i in range(core.settings.n):
         now.along[i] = along(axes[i], rate)
+        core.sample.start_bias[i] = core.bias.value[i]
         now.input[i] = now.aligned[i] - core.bias.value[i]
         if (
             core.health.condition[i] == OUT_OF_RANGE

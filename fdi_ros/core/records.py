@@ -201,7 +201,7 @@ class SampleInput:
     """A sample of one set of channels: values in order, without gaps.
 
     A method that takes any set of channels gets all channels, and ``mask`` has those
-    that are present. Other masks and `bias_std` refer to all channels.
+    that are present. Other masks, `start_bias` and `bias_std` refer to all channels.
     """
 
     stamp: Whole  # ns
@@ -210,7 +210,8 @@ class SampleInput:
     out: Mask  # channels taken out of use, which may still be present
     beyond: Mask  # channels out of range, or unusable in this sample by themselves
     acceleration: Vector  # body angular acceleration, rad/s^2
-    bias_std: Channels  # standard deviation of each channel's initial bias, rad/s
+    start_bias: Channels  # bias from the start that ``z`` does not contain, rad/s
+    bias_std: Channels  # its standard deviation, rad/s
     # variance by the unknown positions of accelerometers in the present turn, (rad/s)^2
     displaced: Channels
     # rate of the body beside that, from the gyros, rad/s

@@ -58,10 +58,21 @@ SHIFTS, SMALLEST_SHIFT = 5, 1.0 / 16.0
 """Number of sizes of a shift of all biases, and the smallest one, standard deviation over
 `Constants.largest_move`. Each further size is twice as large, up to 40 mrad/s of gyros: a
 boost of 10 g moves a gyro of 2 mrad/s a g by 20, and at its end by as much again."""
+RANGES = (0.25, 0.5, 2.0, 4.0, 8.0)
+"""Gains of a unit with a wrong range, of which chips offer several, each twice the one before.
+Without these hypotheses, while the axis of the turn hardly moves, a healthy channel of another
+unit is named."""
+STEADY = 0.5
+"""Least mean rate over the mean of its size, of a turn whose axis hardly moves. In any other a wrong
+range is no constant error, but explains the mean of a slow drift by chance: with it, a drift of
+0.02 deg/s^2 of one gyro of six is named after 1 500 s in place of 240."""
 MOST_HYPOTHESES = (
-    MAX_CHANNELS + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2 + 4 * MAX_UNITS + SHIFTS
+    MAX_CHANNELS
+    + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2
+    + (4 + len(RANGES)) * MAX_UNITS
+    + SHIFTS
 )
-"""Largest number of hypotheses: channels, pairs, four for each unit, shifts of all biases."""
+"""Largest number of hypotheses: channels, pairs, nine for each unit, shifts of all biases."""
 COINCIDENCE = 0.1
 """Prior odds, against one channel, of all pairs with that channel and of each way in which
 any unit is wrong. The value is deliberately large. With three parallel gyros, the same
@@ -120,7 +131,9 @@ class Inference:
     middle: Total  # sums of all samples before the onset
     until: Total  # sums of all samples up to the end of the change at the onset
     y: Channels  # values less their estimated errors, rad/s
+    bias: Channels  # estimated biases, with those from the start, rad/s
     covariance: Square  # M, (rad/s)^2
+    steady: Flag  # 1: the vehicle turns, and the axis of the turn hardly moves
     louder: Channels  # variance of a sample since the onset beyond the learned one, (rad/s)^2
     moved: Real  # by which each bias may have moved since the onset, rad/s
     rate: Vector  # mean body rate, rad/s
@@ -131,6 +144,8 @@ class Inference:
     parity: Parity
     u: Channels  # A y, s/rad
     whitened: Channels  # u in units of its standard deviation with a shift
+    gain: Channels  # of each channel with a wrong range
+    of_range: Channels  # values less the errors of the biases with a wrong range, rad/s
     total: Real  # y' A y / 2
     direction: Directions
     matrix: Matrix
@@ -217,15 +232,31 @@ def fill_mean(
             # A value that may still prove to be a spike counts while it lasts.
             total = kf.total.values[i] + kf.spike_sum[i]
             inference.y[i] = (total - before.values[i]) / count
+        inference.bias[i] = kf.start_bias[i] + kf.states.x[i]
     inference.judged = inference.mask & kf.judged
     # At rest an apparent rate is the fault itself, not motion.
     moves = 1.0 if kf.noise.regime == MOTION else 0.0
+    inference.steady = moves > 0.0 and turns_steadily(params, before, kf.total)
     for a in range(3):
         inference.rate[a] = moves * (kf.total.rate[a] - before.rate[a]) / size
         inference.change[a] = kf.rate[a] - before.instant[a]
     for i in range(n):
         change = moves * along(params.sensors.axes[i], inference.change)
         inference.angular_acceleration[i] = change / (size * params.period)
+
+
+@compiled
+def turns_steadily(params: Constants, since: Total, until: Total) -> bool:
+    """Whether the axis of the turn hardly moves between two moments (`STEADY`)."""
+    by_mean = by_size = 0.0
+    for i in range(params.sensors.n):
+        mean = 0.0
+        for a in range(3):
+            mean += params.sensors.axes[i, a] * (until.rate[a] - since.rate[a])
+        size = until.speed[i] - since.speed[i]
+        by_mean += mean * mean
+        by_size += size * size
+    return by_mean > STEADY * STEADY * by_size
 
 
 @compiled
@@ -471,6 +502,76 @@ def add_units(params: Constants, inference: Inference) -> None:
             if odds > NO_LOG:
                 whole = way == 1 or not params.gain_is_fault
                 add(inference, n, 1, prior + odds, inside, whole)
+        add_ranges(params, inference, inside, prior)
+
+
+@compiled
+def add_ranges(
+    params: Constants, inference: Inference, inside: int, prior: float
+) -> None:
+    """Add each wrong range of a unit, which shows rate and biases times a gain, to the mean of a steady turn.
+
+    The determinants are those of the unknown rate. Where what the biases have in common
+    is unknown, a rate and biases with a wrong range explain any mean, and only these tell.
+    """
+    if not inference.steady:
+        return
+    n = params.sensors.n
+    known = factorise(inference.parity.normal, 3, inference.inverse)
+    for gain in RANGES:
+        set_range(params, inference, inside, gain)
+        inference.fit = inference.total - rest_of_range(params, inference)
+        log_det = factorise(inference.matrix, 3, inference.inverse)
+        for i in range(n):
+            reading = inference.bias[i]
+            reading += along(params.sensors.axes[i], inference.amplitude)
+            inference.direction[0, i] = reading if inside >> i & 1 else 0.0
+        inference.amplitude[0] = gain - 1.0
+        odds = prior - math.log(len(RANGES)) + inference.fit
+        add(inference, n, 1, odds + 0.5 * (known - log_det), inside, False)
+
+
+@compiled
+def set_range(
+    params: Constants, inference: Inference, inside: int, gain: float
+) -> None:
+    """Set the gain of each channel where one unit has a wrong range, and the values without scaled biases."""
+    for i in range(params.sensors.n):
+        inference.gain[i] = gain if inside >> i & 1 else 1.0
+        excess = inference.gain[i] - 1.0
+        inference.of_range[i] = inference.y[i] - excess * inference.bias[i]
+
+
+@compiled
+def rest_of_range(params: Constants, inference: Inference) -> float:
+    """Return half the chi-square that the likeliest rate leaves with the gains set.
+
+    ``inference.amplitude`` is that rate, rad/s.
+    """
+    n = params.sensors.n
+    axes = params.sensors.axes
+    gain = inference.gain
+    weight = inference.parity.weight
+    for a in range(3):
+        inference.along[a] = 0.0
+        for b in range(3):
+            inference.matrix[a, b] = UNKNOWN_RATE if a == b else 0.0
+    rest = 0.0
+    for i in range(n):
+        if inference.mask >> i & 1:
+            weighted = dot_in(weight[i], inference.of_range, n, inference.mask)
+            rest += 0.5 * inference.of_range[i] * weighted
+            for a in range(3):
+                inference.along[a] += gain[i] * axes[i, a] * weighted
+            for j in range(n):
+                both = gain[i] * weight[i, j] * gain[j]
+                for a in range(3):
+                    for b in range(a + 1):
+                        inference.matrix[a, b] += axes[i, a] * both * axes[j, b]
+    invert(inference.matrix, 3, inference.inverse)
+    for a in range(3):
+        inference.amplitude[a] = dot(inference.inverse[a], inference.along, 3)
+    return rest - 0.5 * dot(inference.amplitude, inference.along, 3)
 
 
 @compiled

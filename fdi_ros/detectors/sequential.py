@@ -297,6 +297,7 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
     kf = state.estimator
     for i in range(params.sensors.n):
         sample.z[i] = min(max(sample.z[i], -MAX_RATE), MAX_RATE)
+        kf.start_bias[i] = sample.start_bias[i]
     # After such a pause a new block begins.
     if kf.seconds - kf.used_at > max(1.5 * BLOCK_TIME, 2.5 * params.period):
         drop_block(kf, params.sensors.n)

@@ -183,6 +183,7 @@ class Estimator:
     clean_values: Channels  # A y of that, s/rad
     clean_rate: Vector  # of that, rad/s
     rate: Vector  # of the last sample, rad/s
+    start_bias: Channels  # bias that the values do not contain, rad/s
     corrected: Channels  # values less their estimated errors, rad/s
     # the same, with the rate of the others in place of a spike, rad/s
     imputed: Channels

@@ -23,6 +23,7 @@ from fdi_ros.detectors.naming import (
     FIT,
     FIT_PER_CHECK,
     GAIN_STD,
+    RANGES,
     SHIFTED,
     SHIFTED_AMONG_FEW,
     SHIFTS,
@@ -33,9 +34,11 @@ from fdi_ros.detectors.naming import (
     add_shifts,
     add_units,
     explain,
+    turns_steadily,
     variance_by_turn,
 )
 from fdi_ros.detectors.sequential import Sequential
+from fdi_ros.estimator.estimator import Total
 from fdi_ros.estimator.noise import MOTION
 
 LARGEST = 0.04  # shift of all biases, rad/s
@@ -44,7 +47,7 @@ LARGEST = 0.04  # shift of all biases, rad/s
 class Mean:
     """A mean to be explained, its covariance, and the motion it is of."""
 
-    def __init__(self, geometry, y, covariance, rate, acceleration):
+    def __init__(self, geometry, y, bias, covariance, rate, acceleration, steady=False):
         self.geometry, self.n, self.y, self.covariance = (
             geometry,
             geometry.n,
@@ -55,6 +58,7 @@ class Mean:
         self.rows = allocate(Inference)
         own = self.own = self.rows[0]
         own["mask"] = own["judged"] = (1 << self.n) - 1
+        own["bias"][: self.n], own["steady"] = bias, steady
         own["y"][: self.n], own["covariance"][: self.n, : self.n] = y, covariance
         own["rate"], own["angular_acceleration"][: self.n] = (
             rate,
@@ -149,11 +153,31 @@ def oracle(mean):
                 np.where(inside, about, 0.0)[:, None],
                 std,
             )
+        if mean.own["steady"]:
+            take_ranges(mean, inside, COINCIDENCE / len(units), found)
     prior = SHIFTED if n > 6 else SHIFTED_AMONG_FEW
     for std in LARGEST * SMALLEST_SHIFT * 2.0 ** np.arange(SHIFTS):
         ratio = evidence(mean, std**2 * np.eye(n)) - healthy
         found.append((0, 1, np.log(prior / SHIFTS) + ratio))
     return found
+
+
+def take_ranges(mean, inside, prior, found):
+    """Add each wrong range of a unit: the chi-square of generalised least squares with its axes times the gain."""
+    root = np.linalg.inv(np.linalg.cholesky(mean.covariance))
+
+    def log_likelihood(gain):
+        gains = np.where(inside, gain, 1.0)
+        columns = root @ (mean.geometry.axes * gains[:, None])
+        values = root @ (mean.y - (gains - 1.0) * mean.own["bias"][: mean.n])
+        chi_square = np.linalg.lstsq(columns, values, rcond=None)[1].item()
+        log_det = np.linalg.slogdet(columns.T @ columns)[1]
+        return -0.5 * (chi_square + log_det)
+
+    for gain in RANGES:
+        explained = log_likelihood(gain) - log_likelihood(1.0)
+        channels = mask_of(np.flatnonzero(inside))
+        found.append((channels, 0, np.log(prior / len(RANGES)) + explained))
 
 
 def random_mean(seed, n):
@@ -169,7 +193,10 @@ def random_mean(seed, n):
     # Each channel has noise of its own: without, some sum of channels is known exactly,
     # and the odds of both computations are rounding errors.
     covariance = root @ root.T + 1e-8 * np.eye(n)
-    return Mean(geometry, y, covariance, rng.normal(0, 1, 3), rng.normal(0, 20, 3))
+    bias = rng.normal(0, 0.02, n)
+    rate, acceleration = rng.normal(0, 1, 3), rng.normal(0, 20, 3)
+    steady = seed % 2 == 1
+    return Mean(geometry, y, bias, covariance, rate, acceleration, steady)
 
 
 @pytest.mark.parametrize("n", [5, 6, 7, 9, 12])
@@ -251,6 +278,7 @@ def test_a_unit_whose_three_biases_move_names_none_of_its_channels(seed):
     mean = Mean(
         Geometry(np.tile(np.eye(3), (4, 1)), units=units),
         y,
+        np.zeros(12),
         0.0016**2 * np.eye(12),
         np.zeros(3),
         np.zeros(3),
@@ -263,3 +291,18 @@ def test_a_unit_whose_three_biases_move_names_none_of_its_channels(seed):
     mean.own["y"][:12] = y
     explain(mean.params, mean.own)
     assert mean.own["common"] == mask_of([5])
+
+
+@pytest.mark.parametrize(
+    ("share", "expected"), [(0.0, False), (0.45, False), (0.55, True), (1.0, True)]
+)
+def test_a_turn_is_steady_if_its_mean_rate_is_half_of_its_mean_size(share, expected):
+    """Rates to and fro about one axis, and more in one direction by a share."""
+    mean = random_mean(7, 6)
+    rates = np.where(np.arange(1000) < 500 * (1 + share), 1.0, -1.0)
+    axis = np.array([0.6, 0.0, 0.8])
+    along = mean.geometry.axes @ axis
+    since, until = allocate(Total, 2)
+    until["rate"] = rates.sum() * axis
+    until["speed"][:6] = np.abs(rates).sum() * np.abs(along)
+    assert turns_steadily(mean.params, since, until) is expected
