@@ -58,7 +58,7 @@ def judge_sample(
     clear_verdict(verdict, bank.n)
     # What the method does not state of this sample is not that of an earlier one.
     sample.estimate.is_current = False
-    sample.estimate.checked = 0
+    sample.estimate.checked = sample.estimate.doubtful = 0
     if row == REFUSED:
         return True
     k = 0

@@ -179,6 +179,7 @@ class Estimate:
 
     is_current: Flag  # the other fields belong to this sample
     checked: Mask  # channels whose uncertainty hides no fault
+    doubtful: Mask  # channels that may be faulty, by evidence too weak to declare
     corrected: Channels  # values less their estimated errors, rad/s
     variance: Channels  # of the present noise, (rad/s)^2
     covariance: Square  # of the estimated errors, (rad/s)^2

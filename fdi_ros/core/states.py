@@ -56,6 +56,7 @@ class Reason(str, Enum):
     INTERMITTENT = "its values come and go"
     COPY = "gives the values of another unit: one sensor, no redundancy"
     OLD = "its unit repeats old values while the others move"
+    DOUBTFUL = "it or another may be wrong: too little evidence to declare"
 
 
 REASONS = tuple(Reason)
@@ -65,7 +66,7 @@ _NONE, _DISAGREES, _NON_FINITE, _OUT_OF_RANGE, _STUCK, _FROZEN, _NO_DATA, _TOO_F
     range(8)
 )
 _LATELY, _CANNOT_RUN, _BIAS, _OPERATOR, _ALL_REPEAT, _DRIFTED = range(8, 14)
-_INTERMITTENT, _COPY, _OLD = range(14, len(REASONS))
+_INTERMITTENT, _COPY, _OLD, _DOUBTFUL = range(14, len(REASONS))
 _SHOWN = (OK, OK, SUSPECT, SUSPECT, STALE, STALE, SUSPECT)
 """State by `Condition`, or OK if the condition implies none."""
 _OF_CONDITION = (
@@ -166,6 +167,8 @@ def why_unchecked(core: Core, subset: Subset, i: int) -> int:
         return _BIAS
     if core.now.all_repeat:
         return _ALL_REPEAT
+    if core.sample.estimate.doubtful >> i & 1:
+        return _DOUBTFUL
     if subset.detectable >> i & 1:
         return _LATELY
     return _CANNOT_RUN if subset.refused else _TOO_FEW

@@ -362,7 +362,8 @@ def fill_verdict(
     sample.estimate.excess = kf.excess
     sample.estimate.behind = kf.behind
     sample.estimate.largest_delay = kf.largest_delay
-    sample.estimate.checked = 0 if is_blind(kf) else kf.checked
+    sample.estimate.doubtful = case.doubtful
+    sample.estimate.checked = 0 if is_blind(kf) else kf.checked & ~case.doubtful
     for u in range(params.units):
         sample.estimate.late[u] = kf.late[u]
     suspects = (case.isolated if case.isolated else case.suspects) & kf.mask
@@ -440,7 +441,9 @@ def follow_evidence(params: Constants, state: State, verdict: SampleVerdict) -> 
         follow_case(params, state)
     elif kf.filled == 0 and goes_too_far(params, state):
         undo_move(params, state)
-    elif mean >= params.limit and kf.samples >= case.retry:
+    elif mean < params.limit:
+        case.doubtful = 0
+    elif kf.samples >= case.retry:
         look_for_case(params, state)
 
 

@@ -20,7 +20,7 @@ from fdi_ros.detectors import DETECTORS, detector_class
 from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.samples import Block
-from fdi_ros.monitor.output import ChannelState
+from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.state_file import StateFile
 
@@ -396,6 +396,25 @@ def test_accelerometers_may_be_excluded_and_the_detector_changed_under_way():
     with pytest.raises(ConfigError, match="leaves no rate"):
         pipeline.reconfigure(before.replaced({"excluded_channels": lost}))
     assert pipeline.config is before
+
+
+def test_evidence_that_lasts_and_is_too_little_to_declare_leaves_no_channel_ok():
+    """A small fault, where the positions of the units are not known."""
+    block, _ = flight(1600, seed=3, scale=0.005, arms=ARMS)
+    pipeline = Pipeline(settings())
+    pipeline.sense(range(3))
+    fault = "channel=imu_2.accel_y kind=bias size=0.35 start=6"
+    output = pipeline.process(struck(block, [fault], pipeline.channel_names))
+    force = output.acceleration
+    assert not any(event.declares for event in output.events)
+    at_limit = force.statistic > 0.999 * force.threshold
+    states = force.state[:, force.channel_names.index("imu_2.accel_y")]
+    assert at_limit.sum() > 600
+    assert (states[at_limit] == ChannelState.UNCHECKED).mean() > 0.6
+    assert (states[~at_limit] == ChannelState.OK).mean() > 0.8
+    reasons = {one.reason for one in output.events if one.after.name == "UNCHECKED"}
+    assert Reason.DOUBTFUL in reasons
+    assert (output.state[:, :9][500:] == ChannelState.OK).all()
 
 
 @pytest.mark.parametrize("enabled", ["auto", "on"])
