@@ -49,12 +49,36 @@ def give_sample(core: Core, gyros: Core, sample: Sample, half: int) -> None:
             given.received[i] = sample.felt[place]
     if half == 1:
         follow_turn(core, gyros, sample.stamp)
+        give_delays(core, gyros)
         fill_parts(core)
         for a in range(3):
             core.sample.spin[a] = core.turning.newest[a]
         for i in range(settings.n):
             core.sample.position_std[i] = settings.position_std[i]
             core.sample.displaced[i] = displaced_variance(core, i)
+
+
+@compiled
+def give_delays(core: Core, gyros: Core) -> None:
+    """Give the accelerometers the delays of their units by the gyros, against their first unit."""
+    estimate = gyros.sample.estimate
+    first = unit_of_place(core, gyros, 0)
+    for u in range(core.settings.units):
+        unit = unit_of_place(core, gyros, u)
+        variance = estimate.delay_variance[unit] + estimate.delay_variance[first]
+        core.sample.delay[u] = estimate.delay[unit] - estimate.delay[first]
+        core.sample.delay_variance[u] = variance if estimate.is_current else 0.0
+
+
+@compiled
+def unit_of_place(core: Core, gyros: Core, u: int) -> int:
+    """Return the number of unit u of the accelerometers among the units of the gyros."""
+    for i in range(core.settings.n):
+        if core.settings.members[u] >> i & 1:
+            for unit in range(gyros.settings.units):
+                if gyros.settings.members[unit] >> core.settings.places[i] & 1:
+                    return unit
+    return 0
 
 
 @compiled

@@ -194,6 +194,8 @@ class Estimate:
     late: Units  # certain delay of the stamps of each unit, s, which `restamp` corrects
     behind: Real  # time from measurement to stamp, if the earliest unit is not late, s
     largest_delay: Real  # largest delay between units, s
+    delay: Units  # estimated delay of each unit against the first, s
+    delay_variance: Units  # of `delay`, s^2
     spikes: Counts  # short outliers of each channel so far, left out of the rate
 
 
@@ -222,6 +224,10 @@ class SampleInput:
     # fused specific force of the sample before, m/s^2, beside gyros
     force: Vector
     has_force: Flag
+    # delay of each unit against the first by its gyros, beside accelerometers, s, and the
+    # variance of that, s^2; 0: unknown
+    delay: Units
+    delay_variance: Units
     interrupted: Flag  # a hole in the stream precedes this sample
     # a manoeuvre has just driven a channel out of range: evidence is void
     in_recovery: Flag

@@ -69,6 +69,7 @@ from fdi_ros.estimator.noise import (
     THREE_SIGMA,
     update_unknown,
 )
+from fdi_ros.estimator.rectification import move_by_vibration
 from fdi_ros.estimator.snapshots import (
     add_to_biases,
     is_after_hole,
@@ -475,7 +476,8 @@ def name_channels(params: Constants, state: State) -> None:
     elif not case.isolated:
         # Once a channel is named, the allowed move stays, and so does the name.
         passed = min(size * params.period / MOVE_TIME, 1.0)
-        case.healthy_move = params.bias_move * passed
+        begun = kf.seconds - size * params.period
+        case.healthy_move = passed * move_by_vibration(params, kf, begun)
     if size * params.period > LONG_TIME:
         # A drift is largest at the end.
         size = size // 2 + 1
@@ -487,7 +489,7 @@ def name_channels(params: Constants, state: State) -> None:
     grown = (since - case.onset) * params.period
     inference.slow = params.bias_move > 0.0 and SLOW < grown < WARMS
     case.louder = fill_louder(params, state, size)
-    if case.isolated == 0 and case.healthy_move > 0.0:
+    if case.isolated == 0 and case.healthy_move > 0.0 and params.bias_move > 0.0:
         find_sudden(params, kf, case)
     if explain_beside_moves(params, state, size):
         return

@@ -49,7 +49,11 @@ from fdi_ros.estimator.blocks import (
     update_excess,
     update_incoherent,
 )
-from fdi_ros.estimator.delays import transfer_delays, update_time_offsets
+from fdi_ros.estimator.delays import (
+    learn_delays_of_gyros,
+    transfer_delays,
+    update_time_offsets,
+)
 from fdi_ros.estimator.displacement import close_turn, follow_displacement
 from fdi_ros.estimator.error_states import (
     begin_states,
@@ -88,6 +92,7 @@ from fdi_ros.estimator.noise import (
     update_unknown,
 )
 from fdi_ros.estimator.outliers import find_outliers, forget_doubt
+from fdi_ros.estimator.rectification import follow_vibration
 from fdi_ros.estimator.rest import REST_STD, update_rest
 from fdi_ros.estimator.shared_noise import (
     begin_shared,
@@ -179,6 +184,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     learns = not case.open
     fade_fits(case, n, kf.span if learns else 0.0)
     close_turn(params, kf)
+    follow_vibration(params, kf)
     update_largest_rate(
         noise, kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
     )
@@ -227,7 +233,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
         kf.snapshot_at = kf.seconds
         keep_snapshot(params, kf)
     if learns:
-        compensate_delays(params, state)
+        compensate_delays(params, state, sample)
     predict_innovation_covariance(params, kf)
     if sample.wants_excess:
         update_excess(params, kf)
@@ -244,11 +250,12 @@ def follow_reference(params: Constants, state: State) -> None:
 
 
 @compiled
-def compensate_delays(params: Constants, state: State) -> None:
-    """Compensate well-known delays in the values to come; runs once a second."""
+def compensate_delays(params: Constants, state: State, sample: SampleInput) -> None:
+    """Learn delays of the gyros, and compensate well-known ones in the values to come, once a second."""
     kf = state.estimator
     if params.units > 1 and kf.seconds - kf.delays_checked_at > 1.0:
         kf.delays_checked_at = kf.seconds
+        learn_delays_of_gyros(params, kf, sample)
         if transfer_delays(params, kf):
             # The evidence so far belongs to other sampling instants.
             forget_evidence(params, state)
@@ -322,6 +329,19 @@ def process_sample(params: Constants, state: State, sample: SampleInput) -> None
 
 
 @compiled
+def fill_delays(params: Constants, kf: Estimator, sample: SampleInput) -> None:
+    """Fill the estimated delays of the units."""
+    estimate = sample.estimate
+    estimate.behind = kf.behind
+    estimate.largest_delay = kf.largest_delay
+    for u in range(1, params.units):
+        place = params.layout.delays[u]
+        estimate.late[u] = kf.late[u]
+        estimate.delay[u] = kf.late[u] + kf.states.x[place]
+        estimate.delay_variance[u] = kf.states.p[place, place]
+
+
+@compiled
 def fill_verdict(
     params: Constants, state: State, sample: SampleInput, verdict: SampleVerdict
 ) -> None:
@@ -360,12 +380,9 @@ def fill_verdict(
             ):
                 sample.estimate.covariance[i, i] += innovation * innovation
     sample.estimate.excess = kf.excess
-    sample.estimate.behind = kf.behind
-    sample.estimate.largest_delay = kf.largest_delay
     sample.estimate.doubtful = case.doubtful
     sample.estimate.checked = 0 if is_blind(kf) else kf.checked & ~case.doubtful
-    for u in range(params.units):
-        sample.estimate.late[u] = kf.late[u]
+    fill_delays(params, kf, sample)
     suspects = (case.isolated if case.isolated else case.suspects) & kf.mask
     if case.open and suspects:
         verdict.alarm = True
@@ -491,6 +508,9 @@ class Sequential(Detector):
         samples have one, (rad/s)/(m/s^2).
     delay_std
         Standard deviation of the delay of one unit against another, s.
+    rectified
+        Standard deviation of the move of a bias as vibration begins or ends, over the root
+        mean square of the vibration.
     gain_is_fault
         Whether a wrong gain of a unit makes its channels faulty, as it does of
         accelerometers: gravity always shows it as an error of the vertical channel.
@@ -516,6 +536,7 @@ class Sequential(Detector):
         confidence: float = 0.999,
         bias_walk: float | Sequence[float] = 5e-5,
         bias_move: float = 0.0,
+        rectified: float = 0.0,
         largest_move: float = 0.0,
         g_sensitivity_std: float = 0.0,
         delay_std: float = 0.001,
@@ -540,6 +561,7 @@ class Sequential(Detector):
                 "confidence": confidence,
                 "bias_walk": float(walk.max()),
                 "bias_move": bias_move,
+                "rectified": rectified,
                 "largest_move": largest_move,
                 "g_sensitivity_std": g_sensitivity_std,
                 "delay_std": delay_std,
@@ -576,6 +598,7 @@ class Sequential(Detector):
         params["rest_std"] = REST_STD
         params["g_sensitivity"] = g_sensitivity_std
         params["bias_move"] = bias_move
+        params["rectified"] = rectified
         params["largest_move"] = largest_move
         params["limit"] = self.run_length
         params["confidence"] = confidence

@@ -402,6 +402,31 @@ def fill_gain(
 
 
 @compiled
+def bound_variance(
+    layout: Layout, states: ErrorStates, place: int, value: float, variance: float
+) -> None:
+    """Bound the variance of a state to that of a value, which moves the state towards it.
+
+    The value counts for no more than the difference, however often it is given.
+    """
+    before = states.p[place, place]
+    if before <= variance:
+        return
+    share = (before - variance) / before
+    step = share * (value - states.x[place])
+    for r in range(layout.count):
+        states.x[r] += step * states.p[r, place] / before
+        if r != place:
+            for c in range(layout.count):
+                if c != place:
+                    product = states.p[r, place] * states.p[place, c]
+                    states.p[r, c] -= share * product / before
+    for r in range(layout.count):
+        states.p[r, place] *= 1.0 - share
+        states.p[place, r] = states.p[r, place]
+
+
+@compiled
 def copy_states(layout: Layout, source: ErrorStates, target: ErrorStates) -> None:
     """Copy all states."""
     for r in range(layout.count):

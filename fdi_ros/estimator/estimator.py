@@ -118,6 +118,7 @@ class Constants:
     # of a bias, standard deviation, (rad/s)/(m/s^2), or 0
     g_sensitivity: Real
     bias_move: Real  # of a healthy bias in flight, standard deviation, rad/s
+    rectified: Real  # as of `fdi_ros.model.quantity.Quantity`
     largest_move: Real  # of all healthy biases together within half a minute, rad/s
     determines: Sets  # sets of channels that give a rate
     spans: Sets  # of the sets that give a rate, those with redundancy
@@ -284,6 +285,9 @@ class Estimator:
     largest_change: Real  # of the reference, m/s^2
     force_variance: Real  # of a gyro by g-sensitivity, lately largest, (rad/s)^2
     counted_variance: Real  # part of it that the covariance of samples contains
+    strongest_vibration: Real  # mean square of the strongest lately, (rad/s)^2
+    usual_vibration: Real  # mean square when it last changed, (rad/s)^2
+    vibration_changed_at: Real  # when it last did, s since the start
     rest_rates: Window  # of the last blocks, rad/s
     rest_noise: Vector  # variance of the rate of a block, (rad/s)^2
     rest_bias_variance: Vector  # variance of the rate by the biases, (rad/s)^2

@@ -157,6 +157,7 @@ def _build(
     errors = {
         "bias_walk": config.noise.bias_walk,
         "bias_move": quantity.bias_move * turn_on_std,
+        "rectified": quantity.rectified if turn_on_std > 0.0 else 0.0,
         # With a turn-on error of 0 the biases are known, and stay so.
         "largest_move": quantity.largest_move if turn_on_std > 0.0 else 0.0,
         "g_sensitivity_std": config.noise.g_sensitivity_std,

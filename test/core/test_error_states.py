@@ -20,6 +20,7 @@ from fdi_ros.estimator.error_states import (
     Layout,
     Projection,
     begin_states,
+    bound_variance,
     fill_signals,
     predict,
     prepare_layout,
@@ -101,6 +102,25 @@ class Measured:
             least,
         )
         return self.x_and_p()
+
+
+def test_a_value_given_again_and_again_counts_once():
+    """The first time as a measurement that leaves its own variance, later not at all."""
+    one = Measured(5, 6)
+    one.after(one.rng.normal(0, 0.01, 6), np.zeros(MAX_STATES))
+    x, p = one.x_and_p()
+    place = one.layout["delays"][1]
+    variance = 0.3 * p[place, place]
+    total = p[place, place] ** 2 / (p[place, place] - variance)
+    gain = p[:, place] / total
+    for _ in range(3):
+        bound_variance(one.layout, one.states, place, 0.02, variance)
+        after_x, after_p = one.x_and_p()
+        assert after_p[place, place] == pytest.approx(variance, rel=1e-9)
+        assert after_x == pytest.approx(x + gain * (0.02 - x[place]), abs=1e-12)
+        assert after_p == pytest.approx(
+            p - total * np.outer(gain, gain), rel=1e-9, abs=1e-15
+        )
 
 
 @settings(max_examples=6)

@@ -155,6 +155,10 @@ def rectified(seed, vibration, shift):
     return replace(block, acceleration=Block(block.stamp, force))
 
 
+SHAKEN = [(1.0, 0.2), (1.0, 0.3), (5.0, 0.5)]
+"""Vibration, and standard deviation of what it moves the biases by, m/s^2."""
+
+
 def named_in(output):
     return [
         output.channel_names[event.channel]
@@ -163,8 +167,16 @@ def named_in(output):
     ]
 
 
-@pytest.mark.parametrize("seed", [3, 10, 11])
-@pytest.mark.parametrize(("vibration", "shift"), [(1.0, 0.2), (1.0, 0.3), (5.0, 0.5)])
+@pytest.mark.parametrize(
+    ("vibration", "shift", "seed"),
+    [
+        *((size, moved, k) for size, moved in SHAKEN for k in (3, 10, 11)),
+        # One bias moves by more than twice what the others do.
+        (0.5, 0.3, 15),
+        (0.3, 0.2, 3),
+        (0.3, 0.2, 15),
+    ],
+)
 def test_no_accelerometer_is_named_where_all_rectify_vibration(vibration, shift, seed):
     output = Pipeline(settings()).process(rectified(seed, vibration, shift))
     assert named_in(output) == []
@@ -179,7 +191,36 @@ def test_a_fault_is_named_where_all_accelerometers_rectify_vibration(seed):
     output = pipeline.process(block)
     assert named_in(output) == ["imu_2.accel_y"]
     first = next(event for event in output.events if event.after == ChannelState.FAULTY)
-    assert (first.stamp - START) / 1e9 - 14 < 8.0
+    assert (first.stamp - START) / 1e9 - 14 < 9.0
+
+
+def delays_of(half, units):
+    """Delays of the units after the first, s, and their standard deviations."""
+    estimate = half.core["sample"]["estimate"][0]
+    return estimate["delay"][1:units], np.sqrt(estimate["delay_variance"][1:units])
+
+
+def test_accelerometers_are_late_as_the_gyros_of_their_units_are():
+    """A vehicle that turns and hardly accelerates. The first unit has no accelerometers."""
+    block, _ = flight(3000, units=4)
+    force = np.tile([0.0, 0.0, GRAVITY], (len(block), 4))
+    force += np.random.default_rng(8).normal(0, NOISE, force.shape)
+    z = block.z.copy()
+    z[1:, 3:6] = block.z[:-1, 3:6]
+    z[2:, 9:] = block.z[:-2, 9:]
+    received = np.ones(force.shape, dtype=bool)
+    received[:, :3] = False
+    felt = Block(block.stamp, force, received)
+    pipeline = Pipeline(settings(4))
+    output = pipeline.process(Block(block.stamp, z, None, felt))
+    gyros = delays_of(pipeline, 4)
+    accelerometers = delays_of(pipeline.accelerometers, 3)
+    assert gyros[0] == pytest.approx([0.01, 0.0, 0.02], abs=0.001)
+    assert (gyros[1] < 0.001).all()
+    assert accelerometers[1].min() > 0.003
+    assert accelerometers[1].max() < 0.0065
+    assert (abs(accelerometers[0] - [-0.01, 0.01]) < accelerometers[1]).all()
+    assert (output.acceleration.state[500:] == ChannelState.OK).all()
 
 
 def test_known_lever_arms_are_taken_off():
@@ -322,9 +363,10 @@ def test_message_by_message_equals_the_block():
         ["channel=imu_1.accel_z kind=bias size=4 start=2"],
         Pipeline(settings(accelerometers__enabled="on")).channel_names,
     )
-    # With positions unknown, the rate counts, too, which has seen one sample more.
-    known = settings(accelerometers__position_std=0.0)
-    ear, offline = Ear(Pipeline(known)), Pipeline(known)
+    # With "auto" they begin at the second sample, beside gyros that have learned from the
+    # first one already.
+    config = settings(accelerometers__enabled="on")
+    ear, offline = Ear(Pipeline(config)), Pipeline(config)
     for unit, data in sent(block):
         ear.take(unit, data)
     read = np.array([ImuSource.parse(data, 6)[1] for data in ear.fused])
@@ -333,13 +375,8 @@ def test_message_by_message_equals_the_block():
         *(f"imu_{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"),
         *(f"imu_{k}.accel_{axis}" for k in (1, 2, 3) for axis in "xyz"),
     )
-    # The first sample alone cannot show that accelerations vary.
-    output = offline.process(block[1:])
-    assert np.isnan(read[0, 3:]).all()
-    count = len(read) - 1
-    np.testing.assert_allclose(
-        read[1:, 3:], output.acceleration.rate[:count], rtol=0, atol=1e-9
-    )
+    force = offline.process(block).acceleration
+    assert np.array_equal(read[:, 3:], force.rate[: len(read)])
     named = {live.channel_names[one.channel] for one in ear.events if one.declares}
     assert "imu_1.accel_z" in named
     labels = integrity_labels(live.channel_names, 9)
