@@ -47,16 +47,16 @@ class Reason(str, Enum):
     FROZEN = "frozen: has repeated one value for long"
     NO_DATA = "gives no data"
     TOO_FEW = "too few channels left to check it"
-    LATELY = "most of its recent samples could not be checked"
+    LATELY = "most recent samples could not be checked"
     CANNOT_RUN = "the detector cannot run on the channels left"
     BIAS = "bias not learned yet"
     OPERATOR = "taken out by the operator"
     ALL_REPEAT = "all channels repeat their values: nothing new is measured"
     DRIFTED = "has drifted: its bias is beyond bias.max_drift"
-    INTERMITTENT = "its values come and go"
+    INTERMITTENT = "values come and go"
     COPY = "gives the values of another unit: one sensor, no redundancy"
-    OLD = "its unit repeats old values while the others move"
-    DOUBTFUL = "it or another may be wrong: too little evidence to declare"
+    OLD = "the unit repeats old values while the others move"
+    DOUBTFUL = "a fault is possible, with too little evidence to declare it"
 
 
 REASONS = tuple(Reason)

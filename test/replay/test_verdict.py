@@ -319,7 +319,7 @@ def oscillate(time, rates):
         ),
         (
             lose_values,
-            r"FAULTY: imu_1\.y from .*s\. Reason: its values come and go\. Do not fly before",
+            r"FAULTY: imu_1\.y from .*s\. Reason: values come and go\. Do not fly before",
         ),
         (
             oscillate,
