@@ -698,7 +698,7 @@ MAVLINK = {
     ),
     "failover_min_size": _of_node(
         0.03,
-        "smallest error for which an IMU is taken out of use: the autopilot flies with less",
+        "smallest difference of two IMUs for which one is taken out of use: the autopilot flies with less",
         0.0,
         10.0,
         unit="rad/s",

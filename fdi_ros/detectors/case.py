@@ -170,7 +170,8 @@ class Case:
     # the time in which they did not, s
     unfit: Square
     retry: Whole  # earliest sample at which a case may open again
-    doubtful: Mask  # channels of a refused case that are likelier faulty than not
+    # channels of the last case that evidence opened and odds refused, or all: no fault explains it
+    doubtful: Mask
     before: ErrorStates  # states when the case opened
     moved: Real  # recent move of all biases, rad/s
     moved_at: Real  # time of the last move, s since the start
@@ -237,10 +238,13 @@ def look_for_case(params: Constants, state: State) -> None:
             found = True
             case.onset = scale.first[(scale.newest - since + 1 + KEPT) % KEPT]
     stands = found and open_case(params, state, STANDS * math.log(params.limit))
-    if stands or not found or case.inference.log_odds < 0.0:
+    inference = case.inference
+    # A shift of all biases calls every channel healthy.
+    healthy = inference.log_odds < 0.0 or inference.shift > 0.0
+    if stands or not found or healthy:
         case.doubtful = 0
-    elif case.inference.log_odds >= LEAST_ODDS:
-        case.doubtful = case.inference.union
+    elif inference.log_odds >= LEAST_ODDS:
+        case.doubtful = inference.union
 
 
 @compiled
@@ -320,7 +324,7 @@ def open_case(params: Constants, state: State, least: float) -> bool:
     case.candidate = 0
     case.isolated = 0
     case.suspects = case.witnesses = 0
-    case.unsolved = 0.0
+    case.unsolved = case.healthy_move = 0.0
     copy_states(params.layout, kf.states, case.before)
     since = (kf.samples - case.onset) * params.period
     before = kf.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
@@ -477,7 +481,9 @@ def name_channels(params: Constants, state: State) -> None:
         # Once a channel is named, the allowed move stays, and so does the name.
         passed = min(size * params.period / MOVE_TIME, 1.0)
         begun = kf.seconds - size * params.period
-        case.healthy_move = passed * move_by_vibration(params, kf, begun)
+        move = passed * move_by_vibration(params, kf, begun)
+        # The vibration may change again while the case is open.
+        case.healthy_move = max(case.healthy_move, move)
     if size * params.period > LONG_TIME:
         # A drift is largest at the end.
         size = size // 2 + 1

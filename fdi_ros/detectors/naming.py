@@ -58,10 +58,11 @@ SHIFTS, SMALLEST_SHIFT = 5, 1.0 / 16.0
 """Number of sizes of a shift of all biases, and the smallest one, standard deviation over
 `Constants.largest_move`. Each further size is twice as large, up to 40 mrad/s of gyros: a
 boost of 10 g moves a gyro of 2 mrad/s a g by 20, and at its end by as much again."""
-RANGES = (0.25, 0.5, 2.0, 4.0, 8.0)
-"""Gains of a unit with a wrong range, of which chips offer several, each twice the one before.
-Without these hypotheses, while the axis of the turn hardly moves, a healthy channel of another
-unit is named."""
+RANGES = (0.125, 0.25, 0.5, 2.0, 4.0, 8.0)
+"""Gains of a unit with a wrong range. Chips offer up to four ranges, each twice the one before, so the
+set one may be too large or too small by these. Each has its inverse here: of two units, one with a
+gain of 8 and the other one with 1/8 look alike. Without these hypotheses, while the axis of the turn
+hardly moves, a healthy channel of another unit is named."""
 STEADY = 0.5
 """Least mean rate over the mean of its size, of a turn whose axis hardly moves. In any other a wrong
 range is no constant error, but explains the mean of a slow drift by chance: with it, a drift of
@@ -72,7 +73,7 @@ MOST_HYPOTHESES = (
     + (4 + len(RANGES)) * MAX_UNITS
     + SHIFTS
 )
-"""Largest number of hypotheses: channels, pairs, nine for each unit, shifts of all biases."""
+"""Largest number of hypotheses: channels, pairs, ten for each unit, shifts of all biases."""
 COINCIDENCE = 0.1
 """Prior odds, against one channel, of all pairs with that channel and of each way in which
 any unit is wrong. The value is deliberately large. With three parallel gyros, the same
@@ -513,6 +514,8 @@ def add_ranges(
 
     The determinants are those of the unknown rate. Where what the biases have in common
     is unknown, a rate and biases with a wrong range explain any mean, and only these tell.
+    The prior is flat in the geometric mean of the right and the wrong reading of the rate.
+    So of two units, one with a gain and the other one with its inverse are equally likely.
     """
     if not inference.steady:
         return
@@ -528,7 +531,8 @@ def add_ranges(
             inference.direction[0, i] = reading if inside >> i & 1 else 0.0
         inference.amplitude[0] = gain - 1.0
         odds = prior - math.log(len(RANGES)) + inference.fit
-        add(inference, n, 1, odds + 0.5 * (known - log_det), inside, False)
+        odds += 0.5 * (known - log_det) + 1.5 * math.log(gain)
+        add(inference, n, 1, odds, inside, False)
 
 
 @compiled

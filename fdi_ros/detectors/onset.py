@@ -19,7 +19,6 @@ from fdi_ros.detectors.naming import (
     Inference,
     explain_with_misfit,
     noise_of_mean,
-    turns_steadily,
 )
 from fdi_ros.estimator.error_states import (
     ONE,
@@ -98,10 +97,10 @@ def fill_change(
             inference.mask |= 1 << i
             mean = (until.values[i] - middle.values[i]) / counted
             inference.y[i] = mean - (middle.values[i] - before.values[i]) / count
-        inference.bias[i] = kf.start_bias[i] + kf.states.x[i]
     inference.judged = inference.mask & kf.judged
     moves = 1.0 if kf.noise.regime == MOTION else 0.0
-    inference.steady = moves > 0.0 and turns_steadily(params, middle, until)
+    # A wrong range changes its unit by the gain of the whole rate, not of the change.
+    inference.steady = False
     for a in range(3):
         rate = (until.rate[a] - middle.rate[a]) / second
         inference.rate[a] = moves * (rate - (middle.rate[a] - before.rate[a]) / first)

@@ -407,7 +407,7 @@ def bound_variance(
 ) -> None:
     """Bound the variance of a state to that of a value, which moves the state towards it.
 
-    The value counts for no more than the difference, however often it is given.
+    A value adds only the information that the state does not have yet, however often it is given.
     """
     before = states.p[place, place]
     if before <= variance:

@@ -52,7 +52,7 @@ def follow_vibration(params: Constants, kf: Estimator) -> None:
 def move_by_vibration(params: Constants, kf: Estimator, begun: float) -> float:
     """Return by how much a healthy bias may have moved since a time, standard deviation, rad/s.
 
-    Nothing, unless the vibration changed then.
+    Only `Constants.bias_move`, unless the vibration changed then.
     """
     since_change = begun - kf.vibration_changed_at
     if params.rectified == 0.0 or not -SHOWS < since_change < SETTLES:

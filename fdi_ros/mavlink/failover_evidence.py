@@ -518,8 +518,8 @@ class Evidence:
         """Return the IMUs with which one is compared: in use or trusted, or else all.
 
         One that is stuck, or with an unknown difference, is no measure. For one that is
-        FAULTY, those are that the monitor finds OK, if there are any: two that are FAULTY may
-        be so alike.
+        FAULTY, those are that the monitor does not doubt, if there are any: two that are FAULTY
+        may be so alike.
 
         Also return the only IMU in use or trusted that is a measure, or None.
         """
@@ -529,9 +529,11 @@ class Evidence:
         known = [k for k, size in apart.items() if not math.isnan(size)]
         if not fit:
             return known, None
-        fine = [k for k in known if self._tracks[k].is_ok]
-        is_faulty = ChannelState.FAULTY in self._tracks[unit].states
-        return (is_faulty and fine) or known, known[0] if len(known) == 1 else None
+        tracks = self._tracks
+        fine = [k for k in known if tracks[k].states and not tracks[k].doubts]
+        is_faulty = ChannelState.FAULTY in tracks[unit].states
+        partners = (is_faulty and fine) or known
+        return partners, partners[0] if len(partners) == 1 else None
 
     def _is_blamed(self, track: Track, axes: set[int], witness: int | None) -> bool:
         """Return whether an IMU, named on these axes, is apart on one of them.

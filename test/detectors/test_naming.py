@@ -175,7 +175,8 @@ def take_ranges(mean, inside, prior, found):
         return -0.5 * (chi_square + log_det)
 
     for gain in RANGES:
-        explained = log_likelihood(gain) - log_likelihood(1.0)
+        # A prior that is flat in the rate times the root of the gain.
+        explained = log_likelihood(gain) - log_likelihood(1.0) + 1.5 * np.log(gain)
         channels = mask_of(np.flatnonzero(inside))
         found.append((channels, 0, np.log(prior / len(RANGES)) + explained))
 
@@ -291,6 +292,21 @@ def test_a_unit_whose_three_biases_move_names_none_of_its_channels(seed):
     mean.own["y"][:12] = y
     explain(mean.params, mean.own)
     assert mean.own["common"] == mask_of([5])
+
+
+@pytest.mark.parametrize("gain", [1 / 8, 1 / 4, 1 / 2, 2.0, 4.0, 8.0])
+def test_of_two_units_neither_is_named_if_one_has_another_range(gain):
+    """The other unit with the inverse gain explains the mean as well, and at another rate."""
+    units = ["one"] * 3 + ["two"] * 3
+    axes = np.tile(np.eye(3), (2, 1))
+    rate = np.array([0.9, -0.5, 0.3])
+    y = axes @ rate
+    y[3:] *= gain
+    nothing, covariance = np.zeros(6), 0.003**2 * np.eye(6)
+    geometry = Geometry(axes, units=units)
+    mean = Mean(geometry, y, nothing, covariance, rate, np.zeros(3), steady=True)
+    assert mean.own["common"] == 0
+    assert mean.own["union"] == mask_of(range(6))
 
 
 @pytest.mark.parametrize(

@@ -369,6 +369,18 @@ def test_of_two_that_differ_the_named_one_is_blamed_only_if_the_other_is_sound(
     assert (0 in watched.blamed(2.0)) == is_blamed
 
 
+@pytest.mark.parametrize("state", [OK, UNCHECKED])
+def test_a_named_imu_that_agrees_with_one_that_is_not_doubted_is_not_blamed(
+    state: int,
+) -> None:
+    """The third is off by less than two harmless errors that add up; the monitor cannot check the second."""
+    watched = watch()
+    watched.rate = lambda t: 0.1 * np.array([math.sin(2.1 * t), math.cos(t), 0.5])
+    watched.gyros[2] = biased(0.055)
+    watched.states[0], watched.states[3] = FAULTY, state
+    assert watched.blamed(2.0) == set()
+
+
 # What is no steady error ------------------------------------------------------------------
 
 
