@@ -324,7 +324,7 @@ def open_case(params: Constants, state: State, least: float) -> bool:
     case.candidate = 0
     case.isolated = 0
     case.suspects = case.witnesses = 0
-    case.unsolved = case.healthy_move = 0.0
+    case.unsolved = 0.0
     copy_states(params.layout, kf.states, case.before)
     since = (kf.samples - case.onset) * params.period
     before = kf.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
@@ -481,9 +481,7 @@ def name_channels(params: Constants, state: State) -> None:
         # Once a channel is named, the allowed move stays, and so does the name.
         passed = min(size * params.period / MOVE_TIME, 1.0)
         begun = kf.seconds - size * params.period
-        move = passed * move_by_vibration(params, kf, begun)
-        # The vibration may change again while the case is open.
-        case.healthy_move = max(case.healthy_move, move)
+        case.healthy_move = passed * move_by_vibration(params, kf, begun)
     if size * params.period > LONG_TIME:
         # A drift is largest at the end.
         size = size // 2 + 1
