@@ -30,7 +30,9 @@ from numba.core import cgutils
 from numba.core.ccallback import CFunc
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.typing.typeof import typeof
 from numba.extending import intrinsic
+from numba.np.numpy_support import map_layout
 from numpy.typing import NDArray
 
 from fdi_ros.compiling.cache import Kept, Results
@@ -153,6 +155,7 @@ def compiled(function: F) -> F:
         return _quiet(function)
     dispatcher = numba.njit(error_model="numpy", no_cfunc_wrapper=True)(function)
     dispatcher._cache = Results(function)
+    dispatcher.typeof_pyval = type_of
     _call_as_part(dispatcher)
     _dispatchers.append(dispatcher)
     return cast(F, dispatcher)
@@ -160,15 +163,19 @@ def compiled(function: F) -> F:
 
 def _call_as_part(dispatcher: Any) -> None:
     """Have compiled code link a function in as a `Part`, once for all whole numbers instead of for each constant."""
-    part = numba.njit(
-        pipeline_class=Part,
-        error_model="numpy",
-        no_cfunc_wrapper=True,
-        no_cpython_wrapper=True,
-    )(dispatcher.py_func)
+
+    # Made when first needed: a process that finds all results needs none.
+    @functools.cache
+    def part() -> Any:
+        return numba.njit(
+            pipeline_class=Part,
+            error_model="numpy",
+            no_cfunc_wrapper=True,
+            no_cpython_wrapper=True,
+        )(dispatcher.py_func)
 
     def find(arguments: Any, named: Any) -> Any:
-        found = part.get_call_template(
+        found = part().get_call_template(
             tuple(numba.types.unliteral(one) for one in arguments),
             {name: numba.types.unliteral(one) for name, one in named.items()},
         )
@@ -176,7 +183,27 @@ def _call_as_part(dispatcher: Any) -> None:
         return found
 
     dispatcher.get_call_template = find
-    dispatcher.get_overload = part.get_overload
+    dispatcher.get_overload = lambda signature: part().get_overload(signature)
+
+
+def type_of(value: Any) -> Any:
+    """Return Numba's type of an argument, that Numba itself would derive anew for each array of records."""
+    if isinstance(value, tuple):
+        return numba.types.BaseTuple.from_types(
+            [type_of(one) for one in value], type(value)
+        )
+    if isinstance(value, np.ndarray) and value.dtype.names:
+        element = _record_type(value.dtype, value.dtype.isalignedstruct)
+        return numba.types.Array(
+            element, value.ndim, map_layout(value), readonly=not value.flags.writeable
+        )
+    return typeof(value)
+
+
+@functools.cache
+def _record_type(kind: np.dtype[Any], aligned: bool) -> Any:
+    # Types that differ in `isalignedstruct` alone are equal.
+    return numba.from_dtype(kind)
 
 
 class Callback:

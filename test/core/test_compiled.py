@@ -14,12 +14,16 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numba
+import numpy as np
 import pytest
+from numba.core.typing.typeof import typeof
 
 from fdi_ros.compiling import notice
 from fdi_ros.compiling.cache import Kept as _Kept
+from fdi_ros.compiling.compiled import type_of
 from fdi_ros.compiling.notice import COMPILING, announced, refused
 from fdi_ros.errors import FdiError
 
@@ -38,6 +42,8 @@ clear_declarations(core)
 judge_sums.address
 if compilations():
     print("compiled it")
+if "numba.np.linalg" in sys.modules:
+    print("loaded the compiler")
 print("kept in", folder())
 print("says", core["decision"]["faulty"][0], core["decision"]["ambiguous"][0])
 """
@@ -129,6 +135,42 @@ def test_first_starts_at_once_then_a_load(started, warm):
     third = outcome(start(copy))
     assert third[:2] == (made, "0 0")
     assert "compiled it" not in third[2]
+    # What only the compiler needs takes longer to load than all results.
+    assert "loaded the compiler" in first[2] + second[2]
+    assert "loaded the compiler" not in third[2]
+    for path in made.rglob("*.nbc"):
+        (_, _, (machine_code, names)), *_ = pickle.loads(path.read_bytes())
+        assert len(names) < 0.5 * len(machine_code), "intermediate code is not kept"
+
+
+class Pair(NamedTuple):
+    one: np.ndarray
+    other: float
+
+
+def test_types_of_arguments_are_those_of_numba():
+    fields = [("a", "u1"), ("b", "f8")]
+    aligned = np.zeros(2, np.dtype(fields, align=True))
+    frozen = aligned.copy()
+    frozen.flags.writeable = False
+    # Equal for NumPy, and another type for Numba.
+    places = {"names": ["a", "b"], "formats": ["u1", "f8"], "offsets": [0, 8]}
+    placed = np.zeros(2, np.dtype({**places, "itemsize": 16}))
+    assert placed.dtype == aligned.dtype
+    for value in (
+        aligned,
+        frozen,
+        placed,
+        aligned[::2],
+        aligned.reshape(1, 2),
+        aligned["b"],
+        Pair(aligned, 1.0),
+        (aligned, (placed, 3)),
+        (aligned, aligned),
+        b"bytes",
+        True,
+    ):
+        assert type_of(value) == typeof(value), value
 
 
 def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_written(warm):
