@@ -985,7 +985,11 @@ def test_a_gyro_that_is_still_faulty_stays_out_and_is_announced(
     flying.fault(2, 0.0, [UNCHECKED] * 3, seconds=10.0)
     assert flying.in_use == [True, False, True], "not seen to be well"
     assert flying.texts[-1] == "IMU 2 stays out, monitor does not find it OK"
-    flying.heal(2, 10.0)
+    assert flying.failover.is_done, "nothing to wait for at a stop"
+    flying.heal(2)
+    waits = [not flying.run(0.2).failover.is_done for _ in range(50)]
+    assert any(waits), "a stop waits until it is back"
+    assert not waits[-1]
     assert flying.in_use == [True] * 3
 
 
