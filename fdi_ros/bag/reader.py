@@ -12,7 +12,6 @@ import contextlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
 import zstandard
@@ -35,7 +34,7 @@ from fdi_ros.bag.raw import (
     natural_order,
     tables_of,
 )
-from fdi_ros.bag.recorder_clock import LEAST_SET_BACK, RecorderClock
+from fdi_ros.bag.recorder_clock import RecorderClock
 from fdi_ros.bag.ros1_file import Ros1File
 from fdi_ros.bag.sqlite_file import SqliteFile
 from fdi_ros.bag.tlog import Tlog
@@ -116,7 +115,7 @@ class Recording:
             raise
         #: whether one recorder wrote the files one after the other
         self._is_split = self._is_one_recording()
-        if self._is_split and self._clock_was_set():
+        if self._is_split:
             self._files.sort(key=_number_in_recording)
         else:
             self._files.sort(key=lambda file: file.start_time)
@@ -246,15 +245,6 @@ class Recording:
         ]
         shared = set.intersection(*gyros) if gyros else set()
         return of_ros2 and len(names) == 1 and bool(shared)
-
-    def _clock_was_set(self) -> bool:
-        """Whether a file begins before the end of one with a lower number, and both have some time in common."""
-        numbered = sorted(self._files, key=_number_in_recording)
-        return any(
-            after.start_time <= before.end_time - LEAST_SET_BACK
-            and before.start_time <= after.end_time
-            for before, after in combinations(numbered, 2)
-        )
 
     def _open_all(self, paths: Sequence[Path]) -> None:
         """Open the files. A folder of tables holds one IMU in each.

@@ -411,14 +411,14 @@ def test_an_index_without_end_is_refused(tmp_path, monkeypatch):
         Recording(path)
 
 
-def set_back(at, stamped=False):
-    """Messages before and after the clock was set back by 1.2 s at a sample, and their values.
+def set_back(at, stamped=False, steps=120):
+    """Messages before and after the clock was set back at a sample, and their values.
 
-    ``stamped``: by this clock, too.
+    ``stamped``: by this clock, too. ``steps``: by so many sampling intervals.
     """
     z = np.random.default_rng(0).normal(size=(SAMPLES, 6))
     recorded = STAMP.copy()
-    recorded[at:] -= 120 * STEP
+    recorded[at:] -= steps * STEP
     stamps = recorded if stamped else STAMP
     messages = [
         (topic, time + 1000 * k, imu(stamp, row[3 * k : 3 * k + 3]))
@@ -459,6 +459,16 @@ def test_messages_after_a_clock_was_set_back_follow_those_before(
     assert 100 <= len(values) <= 101
     expected = np.where(np.isnan(values), values, z[100 : 100 + len(values)])
     np.testing.assert_array_equal(values, expected)
+
+
+@pytest.mark.parametrize("make", ["three mcap files", "three sqlite3 files"])
+def test_a_file_of_times_wholly_before_the_first_one_comes_last(make, tmp_path):
+    messages, z = set_back(2 * SAMPLES // 3, steps=10 * SAMPLES)
+    stamp, values, samples = read(MAKES[make](tmp_path / "bag", messages))
+    np.testing.assert_array_equal(stamp, STAMP)
+    np.testing.assert_array_equal(values, z)
+    (fact,) = samples.recording.damage.facts
+    assert "the clock of the recorder was set back by 30 s" in fact
 
 
 def test_files_of_several_recorders_are_read_together(tmp_path):
