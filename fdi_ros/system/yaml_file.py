@@ -5,12 +5,14 @@
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path
 from typing import Any, ClassVar
 
 import yaml
 
 from fdi_ros.errors import FdiError
+from fdi_ros.system import shipped_files
 from fdi_ros.system.files import (
     YAML_BYTES,
     YAML_DEPTH,
@@ -104,11 +106,26 @@ def read_yaml(path: str | Path, what: str, error: type[FdiError]) -> Any:
         text = data.decode("utf-8")
     except UnicodeDecodeError as refused:
         raise error(f"{what} {path} is not YAML: {refused}") from refused
+    except FileNotFoundError as refused:
+        raise error(
+            f"cannot read {what} {path}: {refused.strerror}{_meant(Path(path))}"
+        ) from refused
     except (OSError, ValueError) as refused:
         raise error(
             f"cannot read {what} {path}: {getattr(refused, 'strerror', None) or refused}"
         ) from refused
     return parse_yaml(text, f"{what} {path}", error)
+
+
+def _meant(path: Path) -> str:
+    """Return a hint to the file of a similar name, in the same folder or shipped, or nothing."""
+    names = {
+        file.stem: file.name
+        for file in (*path.parent.glob("*.yaml"), *shipped_files())
+        if file.suffix == ".yaml"
+    }
+    close = difflib.get_close_matches(path.stem, names, n=1)
+    return f", did you mean {shown(names[close[0]])!r}?" if close else ""
 
 
 def parse_yaml(text: str, called: str, error: type[FdiError]) -> Any:

@@ -479,6 +479,8 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
             "replay FLIGHT --config none.yaml",
             "cannot read config none.yaml: No such file or directory",
         ),
+        ("replay FLIGHT --config three_imu", "did you mean 'three_imus.yaml'?"),
+        ("montecarlo refrence.yaml", "did you mean 'reference.yaml'?"),
         (
             "replay FLIGHT --config THREE",
             "no topic '/imu_3/data_raw', it has: /gyro_channels (std_msgs/msg/Float64",
