@@ -286,7 +286,8 @@ class McapFile(BagFile):
     def batches(self, topics: Sequence[str], clock: RecorderClock) -> Iterator[Batch]:
         """Read the messages of the topics."""
         read = 0
-        whole = sum(piece.size for piece in self._pieces)
+        # A file that breaks off in the header of a chunk may hold no bytes of pieces.
+        whole = max(1, sum(piece.size for piece in self._pieces))
         held = 0
         known = -1
         waiting: list[Batch] = []

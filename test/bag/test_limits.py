@@ -227,6 +227,17 @@ def test_a_chunk_that_claims_to_be_enormous_or_is_and_does_not_say_so_is_not_unp
         assert replay(path, CONFIG).stream.damage
 
 
+def test_a_file_that_breaks_off_before_the_content_of_its_first_chunk_has_no_gyros(
+    tmp_path, fdi
+):
+    path = write_mcap(tmp_path / "bag.mcap", fly(SAMPLES)[0])
+    data = path.read_bytes()
+    path.write_bytes(data[: data.index(b"\x04\x00\x00\x00zstd") + 16])
+    done = fdi("inspect", path)
+    assert done.code == 3
+    assert "is cut off after 0 of" in done.out
+
+
 def test_damaged_metadata_is_done_without_and_a_file_that_is_not_there_is_said(
     tmp_path,
 ):
