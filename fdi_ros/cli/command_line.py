@@ -217,7 +217,8 @@ VERBS = {
             "bag": {},
             "--output --write": takes_path("write the config to this file"),
             "--urdf": takes_path(
-                "take the mounts of the units from this URDF, by the frame_id of their messages"
+                "take the mounts of the units from this URDF, by the frame_id of their messages:"
+                " a file, or a topic of the recording such as robot_description"
             ),
             **RESULT_ARGUMENTS,
             "--degrees": {},

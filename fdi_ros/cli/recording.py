@@ -30,7 +30,7 @@ from fdi_ros.inspection.topics import (
     recording_text,
     topics_text,
 )
-from fdi_ros.inspection.urdf import Urdf
+from fdi_ros.inspection.urdf import Urdf, read_urdf
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.report.layout import unit_of
 from fdi_ros.system.files import whole
@@ -45,7 +45,7 @@ def run_inspect(arguments: Namespace) -> int:
     inputs = [path for path in (arguments.bag, arguments.urdf) if path is not None]
     outputs = Outputs(arguments, ("json", "output"), inputs)
     unit = unit_of(arguments.degrees)
-    urdf = None if arguments.urdf is None else Urdf(arguments.urdf)
+    urdf = None if arguments.urdf is None else read_urdf(arguments.urdf, arguments.bag)
     reports, damage, unread = inspect(arguments.bag)
     start, refused = _starting_config(reports, arguments.bag, urdf)
     config = None if start is None else start.text

@@ -10,6 +10,7 @@ how two units are mounted against each other.
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, NoReturn
@@ -18,6 +19,8 @@ from xml.parsers import expat
 
 import numpy as np
 
+from fdi_ros.bag.reader import Recording
+from fdi_ros.core.messages import ENCAPSULATION, byte_order
 from fdi_ros.errors import ConfigError
 from fdi_ros.model.samples import Array
 from fdi_ros.system.files import URDF_BYTES, open_regular
@@ -25,6 +28,43 @@ from fdi_ros.system.text import first_of, shown
 
 #: links listed in an error
 _MOST_LINKS = 20
+_TEXT = "std_msgs/msg/String"
+
+
+def read_urdf(source: Path, recording: Path) -> Urdf:
+    """Return the URDF in a file, or in the topic of this name of a recording.
+
+    `ConfigError` if there is neither, or it is no URDF.
+    """
+    try:
+        with open_regular(source) as file:
+            data = file.read(URDF_BYTES + 1)
+    except FileNotFoundError as error:
+        published = _first_text(recording, str(source))
+        if published is None:
+            raise ConfigError(
+                f"no URDF: there is no file {shown(source)}, and {shown(recording.name)}"
+                f" has no message on a topic of that name with the type {_TEXT}"
+            ) from error
+        return Urdf(str(source), published)
+    except OSError as error:
+        raise ConfigError(f"cannot read {source}: {error.strerror}") from error
+    return Urdf(source.name, data)
+
+
+def _first_text(path: Path, topic: str) -> bytes | None:
+    """Return the first text on a topic of a recording, None if it has none."""
+    with Recording(path) as recording:
+        texts = {one.name for one in recording.topics if one.type == _TEXT}
+        if not texts.intersection((topic, f"/{topic}")):
+            return None
+        batch = next(filter(len, recording.batches([topic])), None)
+        message = b"" if batch is None else batch.message(0)
+    begin = ENCAPSULATION + 4
+    if len(message) < begin:
+        return None
+    (size,) = struct.unpack_from(f"{byte_order(message)}I", message, ENCAPSULATION)
+    return message[begin : begin + size].rstrip(b"\0")
 
 
 class _Joint(NamedTuple):
@@ -47,12 +87,12 @@ class _Place(NamedTuple):
 
 
 class Urdf:
-    """Links and joints of a URDF. `ConfigError` if the file is not one."""
+    """Links and joints of a URDF. `ConfigError` if the data are not one."""
 
-    def __init__(self, path: Path) -> None:
-        #: name of the file, safe to print
-        self.name = shown(path.name)
-        robot = self._read(path)
+    def __init__(self, name: str, data: bytes) -> None:
+        #: file or topic, safe to print
+        self.name = shown(name)
+        robot = self._parsed(data)
         #: names in the order of the file
         self.links = dict.fromkeys(
             link.get("name", "") for link in robot.findall("link")
@@ -85,13 +125,8 @@ class Urdf:
         # Cosines of right angles leave 1e-17, which no reader needs.
         return np.round(rotations, 12) + 0.0
 
-    def _read(self, path: Path) -> Element:
+    def _parsed(self, data: bytes) -> Element:
         """Return the element of the robot."""
-        try:
-            with open_regular(path) as file:
-                data = file.read(URDF_BYTES + 1)
-        except OSError as error:
-            raise ConfigError(f"cannot read {path}: {error.strerror}") from error
         if len(data) > URDF_BYTES:
             self._refuse(f"more than {URDF_BYTES} bytes")
         builder = TreeBuilder()

@@ -5,7 +5,7 @@
 
 import numpy as np
 import pytest
-from bag.recordings import START, STEP, TOPICS, imu, write_mcap
+from bag.recordings import START, STEP, STORE, TOPICS, imu, write_mcap
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from fdi_ros.config.config import Config
 from fdi_ros.errors import ConfigError
 from fdi_ros.inspection.starting_config import starting_config_of
-from fdi_ros.inspection.urdf import Urdf
+from fdi_ros.inspection.urdf import read_urdf
 
+TEXT = "std_msgs/msg/String"
 FRAMES = ("left_imu", "right_imu")
 ANGLES = {"plate": (0.1, -0.2, 2.5), "left": (0.3, 0.4, -0.5), "right": (3.0, 1.2, 0.7)}
 LINKS = "its links: base, arm, plate, left_imu, right_imu"
@@ -51,8 +52,8 @@ def bag(tmp_path):
     return recording(tmp_path / "bag.mcap")
 
 
-def recording(path, frames=FRAMES, change=False):
-    """Two units; on request the second one changes its frame."""
+def recording(path, frames=FRAMES, change=False, described=""):
+    """Two units; on request the second one changes its frame, and a topic has a URDF."""
     random = np.random.default_rng(0)
     messages = []
     for k in range(300):
@@ -60,7 +61,15 @@ def recording(path, frames=FRAMES, change=False):
         for topic, frame in zip(TOPICS, frames, strict=True):
             name = "other_imu" if change and k == 200 and topic == TOPICS[1] else frame
             messages.append((topic, at, imu(at, random.normal(0, 0.01, 3), name)))
-    return write_mcap(path, messages)
+    if described:
+        text = STORE.types[TEXT](described)
+        message = bytes(STORE.serialize_cdr(text, TEXT))
+        messages.append(("/robot_description", START, message))
+    return write_mcap(path, messages, types={"/robot_description": TEXT})
+
+
+def read(path):
+    return read_urdf(path, path.parent)
 
 
 def written(tmp_path, text):
@@ -91,17 +100,33 @@ def test_the_mounts_are_those_of_a_chain_of_fixed_joints(tmp_path, bag, fdi):
     assert "mounts are not" in assumed.text
 
 
+def test_a_recording_may_hold_the_urdf(tmp_path, fdi, refused):
+    bag = recording(tmp_path / "bag.mcap", described=urdf())
+    target = tmp_path / "start.yaml"
+    for name in ("robot_description", "/robot_description"):
+        said = fdi("inspect", bag, "--urdf", name, "--output", target, "--force")
+        assert f"URDF {name} (imu_1 is link left_imu" in said.out
+        mounts = np.reshape(Config.from_file(target).imus.mounts, (2, 3, 3))
+        np.testing.assert_allclose(mounts[1], expected(ANGLES), rtol=0, atol=1e-9)
+    assert "no file description, and bag.mcap has" in refused(
+        "inspect", bag, "--urdf", "description"
+    )
+    bag = recording(tmp_path / "empty.mcap", described=" ")
+    line = refused("inspect", bag, "--urdf", "robot_description")
+    assert "robot_description is no URDF: no element found" in line
+
+
 @given(*[st.tuples(ANGLE, ANGLE, ANGLE)] * 3)
 def test_rotations_are_those_of_scipy(tmp_path_factory, plate, left, right):
     angles = {"plate": plate, "left": left, "right": right}
     robot = written(tmp_path_factory.getbasetemp(), urdf(angles=angles))
-    first, second = Urdf(robot).mounts(FRAMES)
+    first, second = read(robot).mounts(FRAMES)
     np.testing.assert_allclose(first, np.eye(3), rtol=0, atol=1e-11)
     np.testing.assert_allclose(second, expected(angles), rtol=0, atol=1e-9)
 
 
 def test_units_on_one_moving_body_have_mounts(tmp_path):
-    robot = Urdf(written(tmp_path, urdf(kind="revolute")))
+    robot = read(written(tmp_path, urdf(kind="revolute")))
     _, right = robot.mounts(("plate", "right_imu"))
     turn = Rotation.from_euler("xyz", ANGLES["right"]).as_matrix()
     np.testing.assert_allclose(right, turn, rtol=0, atol=1e-9)
@@ -165,7 +190,7 @@ TWO = '<link name="a"/><link name="b"/>'
 )
 def test_a_file_that_is_no_urdf_is_refused(tmp_path, text, why):
     with pytest.raises(ConfigError, match="is no URDF") as error:
-        Urdf(written(tmp_path, text))
+        read(written(tmp_path, text))
     assert why in str(error.value)
     assert len(str(error.value)) < 400
 
@@ -173,13 +198,14 @@ def test_a_file_that_is_no_urdf_is_refused(tmp_path, text, why):
 def test_joints_in_a_circle_are_refused(tmp_path):
     joints = joint("j", "b", "c") + joint("k", "c", "b")
     text = f'<robot>{TWO}<link name="c"/>{joints}</robot>'
-    robot = Urdf(written(tmp_path, text))
+    robot = read(written(tmp_path, text))
     with pytest.raises(ConfigError, match="circle"):
         robot.mounts(["a", "b"])
 
 
 def test_only_a_regular_file_is_read(tmp_path, bag, refused):
-    assert "cannot read" in refused("inspect", bag, "--urdf", tmp_path / "none.urdf")
+    line = refused("inspect", bag, "--urdf", tmp_path / "none.urdf")
+    assert "there is no file" in line
     assert "cannot read" in refused("inspect", bag, "--urdf", "/dev/zero")
     robot = written(tmp_path, BOMB)
     assert "is no URDF" in refused("inspect", bag, "--urdf", robot)
