@@ -50,10 +50,10 @@ from fdi_ros.report.layout import (
     Unit,
     Verdict,
     colour_of,
-    escape,
     head_and_rows,
     number,
     page,
+    prose,
     time_layout,
 )
 from fdi_ros.report.spectrum import Spectrum
@@ -576,9 +576,9 @@ def _card(one: Episode, scored: bool, unit: Unit, origin: int | None) -> str:
     begin = [("begins", f"{date:%Y-%m-%d %H:%M:%S} UTC")] if date is not None else []
     told = (*begin, *detail_words(one, unit, scored))
     rows = "".join(
-        f"<dt>{escape(title)}</dt><dd>{escape(words)}</dd>" for title, words in told
+        f"<dt>{prose(title)}</dt><dd>{prose(words)}</dd>" for title, words in told
     )
-    head = f"<h3>{escape(episode_words(one, unit))}.</h3>"
+    head = f"<h3>{prose(episode_words(one, unit))}.</h3>"
     return f'<article class="{one.state.lower()}">{head}{link}<dl>{rows}</dl></article>'
 
 

@@ -340,6 +340,15 @@ def escape(text: str) -> str:
     return html.escape(visible(text))
 
 
+_BEFORE_UNIT = re.compile(r"(?<=\d) (?=(%|(m?rad|deg)/s|m/s\^2|k?Hz|m?s|h|deg)(?!\w))")
+"""The blank between a number and its unit."""
+
+
+def prose(text: str) -> str:
+    """Return a text from any source as safe HTML in which no line ends between a number and its unit."""
+    return _BEFORE_UNIT.sub("&nbsp;", escape(text))
+
+
 class Link(str):
     """A text that links to another page. ``page``: relative path. Empty: no link."""
 
@@ -353,12 +362,12 @@ class Link(str):
 
 
 def _cell(text: str, tag: str = "td") -> str:
-    # Only sentences wrap, figures and names do not.
-    content = escape(text).replace(" %", "&nbsp;%")
+    # Only sentences wrap, figures and names do not. Those of narrow tables do, but for percent.
+    wraps = len(text) > 24
+    content = prose(text) if wraps else escape(text).replace(" %", "&nbsp;%")
     if isinstance(text, Link) and text.page:
         content = f'<a href="{html.escape(quote(text.page))}">{content}</a>'
-    # Longer texts may wrap.
-    return f"<{tag}{' class=long' if len(text) > 24 else ''}>{content}</{tag[:2]}>"
+    return f"<{tag}{' class=long' if wraps else ''}>{content}</{tag[:2]}>"
 
 
 def html_of(content: Content) -> str:
@@ -371,14 +380,14 @@ def html_of(content: Content) -> str:
         return (
             "<ul>"
             + (
-                "".join(f"<li>{escape(line)}</li>" for line in content)
+                "".join(f"<li>{prose(line)}</li>" for line in content)
                 or "<li>None.</li>"
             )
             + "</ul>"
         )
     # On a narrow screen the entries are below each other.
     rows = (
-        f'<tr><th scope="row">{escape(name)}</th><td>{escape(words)}</td></tr>'
+        f'<tr><th scope="row">{escape(name)}</th><td>{prose(words)}</td></tr>'
         for name, words in content.items()
     )
     return f'<div class="scroll fold"><table class="about"><tbody>{"".join(rows)}</tbody></table></div>'
@@ -433,8 +442,8 @@ def page(
 def _summary_line(line: str | Verdict) -> str:
     """Return one sentence at the top of the page."""
     if isinstance(line, Verdict):
-        return f"<li class={line.severity.value}>{escape(line.words)}</li>"
-    return f"<li>{escape(line)}</li>"
+        return f"<li class={line.severity.value}>{prose(line.words)}</li>"
+    return f"<li>{prose(line)}</li>"
 
 
 def _anchor(part: Part) -> str:
@@ -476,7 +485,7 @@ def _draws(trace: Mapping[str, Any], stores: Sequence[PageStore]) -> bool:
 def _section(part: Part, number: int) -> list[str]:
     """Lay out a part with figures numbered from ``number``."""
     head = f"<h2>{escape(part.title)}</h2>" + (
-        f'<p class="hint">{escape(part.hint)}</p>' if part.hint else ""
+        f'<p class="hint">{prose(part.hint)}</p>' if part.hint else ""
     )
     if isinstance(part, Section):
         content = html_of(part.content)

@@ -24,7 +24,7 @@ from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.episodes import Episode, Evidence, RateMeanwhile, Step, Story
 from fdi_ros.replay.outcomes import FaultEffect, Outcome, Scores
 from fdi_ros.replay.page import Report
-from fdi_ros.report.layout import Section, html_table, page
+from fdi_ros.report.layout import Section, html_of, html_table, page
 from fdi_ros.system.text import shown
 
 ROOT = Path(__file__).parents[2]
@@ -293,6 +293,14 @@ def test_on_a_phone_nothing_is_wider_than_the_screen_and_no_word_is_broken(
             assert ask(driver, f"{over}.map(c => c.textContent)") == []
             assert ask(driver, f"Math.max(...{wide})") <= 390
             assert complaints(driver) == []
+
+
+def test_no_line_ends_between_a_number_and_its_unit():
+    words = "12 of 12, 95 % of 3 hours: 0.1 rad/s"
+    kept = "12 of 12, 95&nbsp;% of 3 hours: 0.1&nbsp;rad/s"
+    for content in ([words], {"found": words}, (("found",), [(words,)])):
+        assert kept in html_of(content)
+    assert f"<li>{kept}</li>" in page("title", [words], [])
 
 
 def test_every_page_stands_alone_is_small_and_has_its_verdict_at_the_top(pages):
