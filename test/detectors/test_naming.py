@@ -27,6 +27,7 @@ from fdi_ros.detectors.naming import (
     SHIFTED,
     SHIFTED_AMONG_FEW,
     SHIFTS,
+    SHOWN,
     SMALLEST_SHIFT,
     TWO_CHECKS,
     Inference,
@@ -170,13 +171,19 @@ def take_ranges(mean, inside, prior, found):
         gains = np.where(inside, gain, 1.0)
         columns = root @ (mean.geometry.axes * gains[:, None])
         values = root @ (mean.y - (gains - 1.0) * mean.own["bias"][: mean.n])
-        chi_square = np.linalg.lstsq(columns, values, rcond=None)[1].item()
+        rate, chi_square = np.linalg.lstsq(columns, values, rcond=None)[:2]
         log_det = np.linalg.slogdet(columns.T @ columns)[1]
-        return -0.5 * (chi_square + log_det)
+        return rate, -0.5 * (chi_square.item() + log_det)
 
+    healthy = log_likelihood(1.0)[1]
     for gain in RANGES:
+        rate, log_density = log_likelihood(gain)
+        # Neither unit would show so little of the turn.
+        smaller = min(gain, 1.0) * np.linalg.norm(rate)
+        if np.linalg.norm(mean.own["rate"]) < SHOWN * smaller:
+            continue
         # A prior that is flat in the rate times the root of the gain.
-        explained = log_likelihood(gain) - log_likelihood(1.0) + 1.5 * np.log(gain)
+        explained = log_density - healthy + 1.5 * np.log(gain)
         channels = mask_of(np.flatnonzero(inside))
         found.append((channels, 0, np.log(prior / len(RANGES)) + explained))
 
