@@ -69,7 +69,7 @@ from fdi_ros.estimator.noise import (
     THREE_SIGMA,
     update_unknown,
 )
-from fdi_ros.estimator.rectification import move_by_vibration
+from fdi_ros.estimator.rectification import move_of_healthy_bias
 from fdi_ros.estimator.snapshots import (
     add_to_biases,
     is_after_hole,
@@ -125,10 +125,6 @@ SUDDEN = 8.0  # log odds of a change at the onset, which no slow move explains
 SLOWLY = 2.5
 """Time in which a healthy bias moves by `Constants.bias_move`, standard deviation, s. A thermal
 shock of 6 mrad/s in 5 s is 2.5 times as fast and changes by less than noise."""
-MOVE_TIME = 1.0
-"""Age of a fault, s, from which it must exceed what healthy biases move in flight. In simulated
-thermal shocks of 6 mrad/s a healthy gyro is named in 17 of 48 flights without this, in 9
-with 5 s, and in 2 with 1 s."""
 SLOW = 2.0
 """Time from the onset to a candidate, s, from which the evidence has grown slowly, up to `WARMS`:
 a step of 0.02 rad/s opens a case within 0.6 s, and what grows for longer is no warming."""
@@ -479,9 +475,7 @@ def name_channels(params: Constants, state: State) -> None:
         case.healthy_move = 0.0
     elif not case.isolated:
         # Once a channel is named, the allowed move stays, and so does the name.
-        passed = min(size * params.period / MOVE_TIME, 1.0)
-        begun = kf.seconds - size * params.period
-        case.healthy_move = passed * move_by_vibration(params, kf, begun)
+        case.healthy_move = move_of_healthy_bias(params, kf, size * params.period)
     if size * params.period > LONG_TIME:
         # A drift is largest at the end.
         size = size // 2 + 1

@@ -184,7 +184,6 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     learns = not case.open
     fade_fits(case, n, kf.span if learns else 0.0)
     close_turn(params, kf)
-    follow_vibration(params, kf)
     update_largest_rate(
         noise, kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
     )
@@ -201,6 +200,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
         learns,
     )
     update_shared_level(params, kf)
+    follow_vibration(params, kf)
     predict(params.layout, kf.states, kf.seconds - kf.learned_at)
     kf.learned_at = kf.seconds
     follow_reference(params, state)

@@ -287,6 +287,7 @@ class Estimator:
     counted_variance: Real  # part of it that the covariance of samples contains
     strongest_vibration: Real  # mean square of the strongest lately, (rad/s)^2
     usual_vibration: Real  # mean square when it last changed, (rad/s)^2
+    vibration_changes: Flag  # that of the last block is another one than the usual
     vibration_changed_at: Real  # when it last did, s since the start
     rest_rates: Window  # of the last blocks, rad/s
     rest_noise: Vector  # variance of the rate of a block, (rad/s)^2

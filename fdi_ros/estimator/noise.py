@@ -186,6 +186,9 @@ class SharedNoise:
     rate_sum: Vector  # rad/s
     rate_squares: Vector  # (rad/s)^2
     within: Vector  # variance of the rate within a block, about a line, (rad/s)^2
+    present: (
+        Vector  # vibration of the last block about each axis, mean square, (rad/s)^2
+    )
     vibration: Vector  # of the body about each axis, mean square, (rad/s)^2
 
 
