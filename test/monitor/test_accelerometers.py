@@ -142,8 +142,11 @@ def test_the_fused_specific_force_is_as_far_off_as_its_covariance_says():
 TAKE_OFF, LANDING = 800, 2000  # samples
 
 
-def rectified(seed, vibration, shift):
-    """A flight that shakes all units alike from take-off to landing, and moves every bias while it does, m/s^2."""
+def rectified(seed, vibration, shift, at_the_end=0.0):
+    """A flight that shakes all units alike from take-off to landing, and moves every bias while it does, m/s^2.
+
+    ``at_the_end``: what one bias moves by with the landing, and keeps.
+    """
     block, _ = flight(2400, seed=seed, scale=0.005, bias=0.1, size=0.5)
     rng = np.random.default_rng(seed)
     runs = np.zeros(2400)
@@ -152,6 +155,7 @@ def rectified(seed, vibration, shift):
     body = np.tile(rng.normal(0, vibration, (2400, 3)), 3)
     own = rng.normal(0, 0.1 * vibration, (2400, 9)) + rng.normal(0, shift, 9)
     force = block.acceleration.z + runs * (body + own)
+    force[LANDING:, 4] += at_the_end
     return replace(block, acceleration=Block(block.stamp, force))
 
 
@@ -179,6 +183,13 @@ def named_in(output):
 )
 def test_no_accelerometer_is_named_where_all_rectify_vibration(vibration, shift, seed):
     output = Pipeline(settings()).process(rectified(seed, vibration, shift))
+    assert named_in(output) == []
+
+
+@pytest.mark.parametrize("seed", [3, 10])
+@pytest.mark.parametrize("move", [-0.3, 0.3])
+def test_no_accelerometer_is_named_whose_bias_moves_as_vibration_ends(seed, move):
+    output = Pipeline(settings()).process(rectified(seed, 1.0, 0.0, move))
     assert named_in(output) == []
 
 
