@@ -39,12 +39,16 @@ DECAY = 0.5
 REFUTING = 300 * MS  #: Agreement refutes a doubt that has stood for this time, ns.
 BREAK = 100 * MS  #: A shorter break ends no agreement, and no difference, ns.
 HEALED = NS // 2  #: Time of agreement after which an earlier size is forgotten, ns.
-SET_STANDS = 300 * MS  #: A set must stand for this time to name an IMU, ns,
-LONGEST_BREAK = 200 * MS  #: without a break longer than this, ns.
+#: A set must stand for this time to name an IMU, ns, and a name that comes with a difference
+#: is no older than it by more.
+SET_STANDS = 300 * MS
+LONGEST_BREAK = 200 * MS  #: A set stands over a break of this length, ns.
 #: Least error of the odd one in a set of several IMUs, or suspected, and of one that is
 #: compared with only one other IMU, in ``min_size``.
 VOTE = 2.0
-SUSPECT_STANDS = NS  #: An IMU must be suspected, and the odd one, for this time, ns.
+#: An IMU must be suspected, and the odd one, for this time, ns, and a difference that is younger
+#: than the name: the monitor takes 0.2 to 0.8 s to doubt the other IMU.
+SUSPECT_STANDS = NS
 #: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
 #: 0.2 s to exclude a spike. An autopilot whose primary gyro reads zero is at 50 deg then.
 CLEAR_DIFFERENCE = 0.5
@@ -124,6 +128,9 @@ class Track:
     nearest: Vector = UNKNOWN_RATES  #: Difference to the nearest partner, rad/s.
     bound: float = math.nan  #: A bound on that, rad/s.
     sizes: Vector = UNKNOWN_RATES  #: Largest difference of late, by axis, rad/s.
+    #: When each axis was last not FAULTY, and not apart enough for one witness.
+    unnamed_at: list[int] = field(default_factory=lambda: [0] * 3)
+    near_at: list[int] = field(default_factory=lambda: [0] * 3)
     #: Doubts of the monitor that agreement has refuted. None: the IMU is not trusted.
     refuted: set[ChannelState] | None = None
     doubted: set[ChannelState] = field(default_factory=set)  #: Last doubts.
@@ -177,6 +184,16 @@ def _note_sizes(track: Track, agreed: int | None, held: float, now: int) -> None
     if agreed is None or now - agreed < HEALED:
         x, y, z = map(max, track.nearest, [held * size for size in track.sizes])
     track.sizes = x, y, z
+
+
+def _note_apart(track: Track, least: float, now: int) -> None:
+    """Note which axes are not FAULTY, or not apart by ``least``, rad/s."""
+    faulty = track.axes(ChannelState.FAULTY)
+    for axis, size in enumerate(track.sizes):
+        if axis not in faulty:
+            track.unnamed_at[axis] = now
+        if not size >= least:
+            track.near_at[axis] = now
 
 
 def _note_names(track: Track, agreed: int | None, now: int) -> None:
@@ -324,12 +341,13 @@ class Evidence:
         for k, track in enumerate(self._tracks):
             agreed = self._note_agreement(k, partners[k], k in out, now, elapsed)
             _note_sizes(track, agreed, held, now)
+            _note_apart(track, VOTE * self._min_size, now)
             _note_names(track, agreed, now)
             faulty = track.axes(ChannelState.FAULTY)
             axes = faulty | accused if k == odd else faulty
             if track.outdated and not self._is_odd(k, units):
                 axes = axes - (track.outdated - self._axes_off_again(k, units, now))
-            blamed = self._is_blamed(track, axes, witnesses[k])
+            blamed = self._is_blamed(track, axes, witnesses[k], now)
             if k in out or blamed:
                 self._note_wrong(track, partners[k], axes)
             elif agreed is not None and now - agreed >= HEALED:
@@ -535,18 +553,28 @@ class Evidence:
         partners = (is_faulty and fine) or known
         return partners, partners[0] if len(partners) == 1 else None
 
-    def _is_blamed(self, track: Track, axes: set[int], witness: int | None) -> bool:
+    def _is_blamed(
+        self, track: Track, axes: set[int], witness: int | None, now: int
+    ) -> bool:
         """Return whether an IMU, named on these axes, is apart on one of them.
 
         Of two IMUs either may be wrong, or both by less than ``min_size``. So the monitor must
         not doubt that axis of the other one, and the difference must be `VOTE` times as large.
+        Of a name that is older than the difference, the monitor may have yet to doubt the other
+        one: the difference must stand for `SUSPECT_STANDS`.
 
         witness: the only IMU with which this one could be compared, or None.
         """
         least = self._min_size
         if witness is not None:
-            axes = axes - self._tracks[witness].axes(*DOUBTS)
             least *= VOTE
+            early = {
+                axis
+                for axis, near_at in enumerate(track.near_at)
+                if near_at - track.unnamed_at[axis] >= SET_STANDS
+                and now - near_at < SUSPECT_STANDS
+            }
+            axes = axes - self._tracks[witness].axes(*DOUBTS) - early
         return any(track.sizes[axis] >= least for axis in axes)
 
     def _is_trusted(self, unit: int) -> bool:

@@ -753,6 +753,30 @@ def test_of_two_imus_an_old_name_is_no_witness_against_a_new_difference(
     assert watched.blamed(1.0) == {0}
 
 
+def test_of_two_imus_a_name_for_a_harmless_error_waits_for_the_doubt_of_the_other() -> (
+    None
+):
+    """One is FAULTY and off by 0.02 rad/s. The other one fails, and is named 0.5 s later."""
+    watched = watch(2)
+    watched.gyros[0] = biased(0.02)
+    watched.states[0] = FAULTY
+    assert not watched.blamed(1.0)
+    watched.gyros[1] = biased(-0.3)
+    assert not watched.blamed(0.5)
+    watched.states[3] = FAULTY
+    assert not watched.blamed(5.0)
+
+
+def test_of_two_imus_one_with_a_name_for_a_harmless_error_may_grow_worse() -> None:
+    watched = watch(2)
+    watched.gyros[0] = biased(0.02)
+    watched.states[0] = FAULTY
+    assert not watched.blamed(1.0)
+    watched.gyros[0] = biased(0.3)
+    assert not watched.blamed(0.9)
+    assert watched.blamed(0.5) == {0}
+
+
 def test_of_three_imus_an_old_name_counts_for_the_odd_one() -> None:
     """A fault that comes and goes while it stays declared."""
     watched = watch()
