@@ -13,9 +13,9 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.estimator.estimator import Constants, Estimator
+from fdi_ros.estimator.error_states import ErrorStates
+from fdi_ros.estimator.estimator import SNAPSHOTS, TIERS, Constants, Estimator
 from fdi_ros.estimator.noise import RECENT_BLOCKS
-from fdi_ros.estimator.snapshots import move_biases
 
 LASTS = 30.0
 """Time constant with which the strongest vibration is forgotten, s: a bias that was learned in a
@@ -41,7 +41,7 @@ with 5 s, and in 2 with 1 s."""
 def follow_vibration(params: Constants, kf: Estimator) -> None:
     """Follow the mean square of the vibration that the accelerometers feel, once a block.
 
-    Where it changes, every bias may move.
+    Where it changes, the biases may move.
     """
     if params.rectified == 0.0:
         return
@@ -63,9 +63,32 @@ def follow_vibration(params: Constants, kf: Estimator) -> None:
     kf.vibration_changes = is_other(present + expected, usual, OTHER_BLOCK)
     if is_other(vibration + expected, usual, OTHER):
         change = abs(vibration - kf.usual_vibration)
-        move_biases(params, kf, params.rectified * math.sqrt(change), 0.0)
+        std = min(params.rectified * math.sqrt(change), params.largest_move)
+        move_differences(params, kf, std)
         kf.usual_vibration = vibration
         kf.vibration_changed_at = kf.seconds
+
+
+@compiled
+def move_differences(params: Constants, kf: Estimator, std: float) -> None:
+    """Widen the differences of the biases by a standard deviation, rad/s, now and in all snapshots.
+
+    What the biases have in common is never learned, and so is as uncertain as at the start.
+    """
+    add_differences(params, kf, kf.states, std * std)
+    for k in range(TIERS * SNAPSHOTS):
+        add_differences(params, kf, kf.snapshots[k].states, std * std)
+
+
+@compiled
+def add_differences(
+    params: Constants, kf: Estimator, states: ErrorStates, variance: float
+) -> None:
+    """Add a variance of independent biases, (rad/s)^2, less what of them is a common rate."""
+    n = params.sensors.n
+    for i in range(n):
+        for j in range(n):
+            states.p[i, j] += variance * kf.shared.even.information[i, j]
 
 
 @compiled
