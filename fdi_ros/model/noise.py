@@ -9,6 +9,7 @@ the standard library suffice.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -362,6 +363,17 @@ def max_normal_threshold(directions: Array, probability: float) -> float:
     beyond the threshold along each direction in turn (Naiman and Priebe 2001), which
     keeps the relative accuracy far into the tail.
     """
+    # A sweep builds the same methods for each of its faults.
+    return _max_normal_threshold(
+        directions.astype(np.float64).tobytes(), directions.shape, probability
+    )
+
+
+@functools.lru_cache(1024)
+def _max_normal_threshold(
+    data: bytes, shape: tuple[int, int], probability: float
+) -> float:
+    directions = np.frombuffer(data).reshape(shape)
     kept: list[int] = []
     for i, direction in enumerate(directions):
         # Equal directions, except for rounding, count once.
