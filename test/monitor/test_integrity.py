@@ -224,7 +224,7 @@ def test_without_faults_the_level_is_the_quantile_of_the_noise():
     level = integrity(noise=0.01, prior=0.0, risk=1e-4).of(ALL).level
     # H'H = 2 I: every component has half the variance of a channel.
     assert level == pytest.approx(
-        0.01 * np.sqrt(0.5) * NormalDist().inv_cdf(1 - 0.5e-4) * np.ones(3), rel=1e-9
+        0.01 * np.sqrt(0.5) * NormalDist().inv_cdf(1 - 0.5e-4) * np.ones(3), rel=1e-8
     )
 
 
