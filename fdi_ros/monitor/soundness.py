@@ -237,16 +237,20 @@ def own_noise(residual: Array, axes: Array) -> Array:
     covariance = np.atleast_2d(np.cov(rows, rowvar=False))
     own = axes[known]
     variance = np.ones(len(own))
-    visible = np.maximum(np.diag(_left_by_fit(own, variance)), LEAST_VISIBLE_SHARE)
-    least = LEAST_OF_VISIBLE * visible
+    left = _left_by_fit(own, variance)
+    share = np.maximum(np.diag(left), LEAST_VISIBLE_SHARE)
+    least = LEAST_OF_VISIBLE * share
     for _ in range(PASSES):
-        left = _left_by_fit(own, variance)
         square = np.einsum("ij,jk,ik->i", left, covariance, left)
-        share = np.maximum(np.diag(left), LEAST_VISIBLE_SHARE)
         variance = np.maximum(np.sqrt(variance * square / share), LEAST_RESIDUAL**2)
+        left = _left_by_fit(own, variance)
+        share = np.maximum(np.diag(left), LEAST_VISIBLE_SHARE)
         # Where others err alike, one channel would take all the weight and seem free of noise.
-        share = np.maximum(np.diag(_left_by_fit(own, variance)), LEAST_VISIBLE_SHARE)
-        variance *= np.maximum(least / (1.0 - least) * (1.0 - share) / share, 1.0)
+        factor = least / (1.0 - least) * (1.0 - share) / share
+        if factor.max() > 1.0:
+            variance *= np.maximum(factor, 1.0)
+            left = _left_by_fit(own, variance)
+            share = np.maximum(np.diag(left), LEAST_VISIBLE_SHARE)
     noise[known] = np.sqrt(variance)
     noise[noise <= 2.0 * LEAST_RESIDUAL] = np.nan
     return noise
