@@ -19,11 +19,12 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import pytest
+from numba.core import event
 from numba.core.typing.typeof import typeof
 
 from fdi_ros.compiling import notice
 from fdi_ros.compiling.cache import Kept as _Kept
-from fdi_ros.compiling.compiled import type_of
+from fdi_ros.compiling.compiled import Part, type_of
 from fdi_ros.compiling.notice import COMPILING, announced, refused
 from fdi_ros.errors import FdiError
 
@@ -171,6 +172,30 @@ def test_types_of_arguments_are_those_of_numba():
         True,
     ):
         assert type_of(value) == typeof(value), value
+
+
+class Passes(event.Listener):
+    """Remembers the passes of Numba, and the types of arguments as they are written."""
+
+    def __init__(self):
+        self.names, self.arguments = [], set()
+
+    def on_start(self, event):
+        self.names.append(event.data["name"].partition(" ")[0])
+        self.arguments.add(event.data["args"])
+
+    def on_end(self, event):
+        pass
+
+
+def test_a_part_goes_through_the_passes_that_it_needs_alone():
+    """They, and the types of large records that each writes out, take most of the time."""
+    part = numba.njit(pipeline_class=Part, no_cpython_wrapper=True)(lambda x: x + 1.0)
+    with event.install_listener("numba:run_pass", Passes()) as passes:
+        part.compile((numba.float64,))
+    assert len(passes.names) <= 14
+    assert {"reconstruct_ssa", "native_lowering"} <= set(passes.names)
+    assert passes.arguments == {"types of arguments"}
 
 
 def test_what_was_prepared_is_taken_over_where_the_installation_cannot_be_written(warm):
