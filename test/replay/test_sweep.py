@@ -171,7 +171,7 @@ def test_what_is_declared_without_a_fault_comes_first_and_is_left_out():
 
 def test_figures_of_a_vehicle_at_rest_are_called_that():
     # The flight rests for its first 8 s.
-    at_rest, plan = swept(flown()[:800], "kind=bias size=0.1", within=1.0)
+    at_rest, plan = swept(flown()[:800], "kind=bias size=0.1", within=1.5)
     text = sweep_text([at_rest], plan, "bag")
     # Of a dozen faults the share is not 95 %, whatever came of them.
     assert (
