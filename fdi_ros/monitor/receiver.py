@@ -23,11 +23,12 @@ from fdi_ros.core.messages import ImuTemplate, MessageError, as_batch
 from fdi_ros.core.path import Path
 from fdi_ros.core.records import EventRow, Live
 from fdi_ros.core.sources import SOURCES, Source, source_of
-from fdi_ros.detectors import DETECTORS, create_detector, detector_class
+from fdi_ros.detectors import create_detector, detector_class
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Block
 from fdi_ros.monitor.accelerometers import felt_units, varies
+from fdi_ros.monitor.building import GUARD
 from fdi_ros.monitor.output import (
     FUSED,
     INTEGRITY,
@@ -304,9 +305,7 @@ def warm_detector(name: str) -> None:
 
 def warm_path() -> None:
     """Compile or load what takes samples through any monitor, in blocks and in messages, and what messages need."""
-    pipeline = Pipeline(
-        Config.from_parameters({"detector.name": next(iter(DETECTORS))})
-    )
+    pipeline = Pipeline(Config.from_parameters({"detector.name": GUARD}))
     # Nothing is prepared for a set of channels that lacks two.
     z = np.zeros((2, pipeline.geometry.n))
     z[1, :2] = np.nan

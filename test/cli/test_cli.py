@@ -366,6 +366,23 @@ def test_no_two_processes_compile_the_same(monkeypatch):
     assert (warm_path,) in handed_out
 
 
+PATH_ALONE = """
+from fdi_ros.compiling import compiled
+from fdi_ros.monitor.receiver import warm_path
+
+warm_path()
+print({one.function.__module__ for one in compiled._callbacks if one.compiled})
+"""
+
+
+def test_what_samples_pass_through_is_compiled_with_the_guard_alone():
+    """The first start waits for no method that only comparisons use."""
+    done = subprocess.run(
+        [sys.executable, "-c", PATH_ALONE], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "{'fdi_ros.detectors.sequential'}\n"
+
+
 NEW_FORMS = """
 import sys
 from fdi_ros.cli.command_line import main
