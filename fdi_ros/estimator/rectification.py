@@ -13,8 +13,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
-from fdi_ros.estimator.error_states import ErrorStates
-from fdi_ros.estimator.estimator import SNAPSHOTS, TIERS, Constants, Estimator
+from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import RECENT_BLOCKS
 
 LASTS = 30.0
@@ -30,7 +29,6 @@ SHOWS = 4.0
 a strong one takes longest. With 2 s, accelerometers are named 2.5 s after it ends."""
 SETTLES = 5.0
 """Time from a change of the vibration in which the biases follow, s: sensors warm with motors."""
-
 MOVE_TIME = 1.0
 """Age of a fault, s, from which it must exceed what healthy biases move in flight. In simulated
 thermal shocks of 6 mrad/s a healthy gyro is named in 17 of 48 flights without this, in 9
@@ -39,10 +37,7 @@ with 5 s, and in 2 with 1 s."""
 
 @compiled
 def follow_vibration(params: Constants, kf: Estimator) -> None:
-    """Follow the mean square of the vibration that the accelerometers feel, once a block.
-
-    Where it changes, the biases may move.
-    """
+    """Follow the mean square of the vibration that the accelerometers feel, once a block."""
     if params.rectified == 0.0:
         return
     n = params.sensors.n
@@ -54,7 +49,9 @@ def follow_vibration(params: Constants, kf: Estimator) -> None:
     for i in range(n):
         own = noise.now.sample[i]
         energy = noise.energies[kf.all_blocks % RECENT_BLOCKS, i]
-        vibration += 3.0 / n * max(own * noise.recent_ratio[i] - params.expected[i], 0)
+        vibration += (
+            3.0 / n * max(own * noise.recent_ratio[i] - params.expected[i], 0.0)
+        )
         present += 3.0 / n * max(own * energy - params.expected[i], 0.0)
         expected += 3.0 / n * params.expected[i]
     faded = kf.strongest_vibration * math.exp(-kf.span / LASTS)
@@ -62,33 +59,8 @@ def follow_vibration(params: Constants, kf: Estimator) -> None:
     usual = kf.usual_vibration + expected
     kf.vibration_changes = is_other(present + expected, usual, OTHER_BLOCK)
     if is_other(vibration + expected, usual, OTHER):
-        change = abs(vibration - kf.usual_vibration)
-        std = min(params.rectified * math.sqrt(change), params.largest_move)
-        move_differences(params, kf, std)
         kf.usual_vibration = vibration
         kf.vibration_changed_at = kf.seconds
-
-
-@compiled
-def move_differences(params: Constants, kf: Estimator, std: float) -> None:
-    """Widen the differences of the biases by a standard deviation, rad/s, now and in all snapshots.
-
-    What the biases have in common is never learned, and so is as uncertain as at the start.
-    """
-    add_differences(params, kf, kf.states, std * std)
-    for k in range(TIERS * SNAPSHOTS):
-        add_differences(params, kf, kf.snapshots[k].states, std * std)
-
-
-@compiled
-def add_differences(
-    params: Constants, kf: Estimator, states: ErrorStates, variance: float
-) -> None:
-    """Add a variance of independent biases, (rad/s)^2, less what of them is a common rate."""
-    n = params.sensors.n
-    for i in range(n):
-        for j in range(n):
-            states.p[i, j] += variance * kf.shared.even.information[i, j]
 
 
 @compiled
@@ -104,7 +76,8 @@ def move_of_healthy_bias(params: Constants, kf: Estimator, age: float) -> float:
     By `Constants.bias_move` in `MOVE_TIME`, or at once where the vibration changed.
     """
     since_change = kf.seconds - age - kf.vibration_changed_at
-    changed = kf.vibration_changes or -SHOWS < since_change < SETTLES
+    changes = kf.vibration_changes and age < SHOWS
+    changed = changes or -SHOWS < since_change < SETTLES
     if params.rectified == 0.0 or not changed:
         return min(age / MOVE_TIME, 1.0) * params.bias_move
     return params.rectified * math.sqrt(kf.strongest_vibration)

@@ -361,10 +361,13 @@ def update_vibration(params: Constants, kf: Estimator) -> None:
             within = (
                 about - slope * slope * (length * length - 1.0) / (12.0 * length)
             ) / (length - 2.0)
-        if share > 0.0:
-            shared.present[a] = max(within - noise, 0.0)
         shared.within[a] += share * (within - shared.within[a])
         shared.rate_sum[a] = shared.rate_squares[a] = 0.0
         shared.vibration[a] = max(
             shared.within[a] - noise, shared.square[a, a] - noise, 0.0
         )
+        if length <= 2.0:
+            # Two samples are always on a line.
+            shared.present[a] = shared.vibration[a]
+        elif share > 0.0:
+            shared.present[a] = max(within - noise, 0.0)

@@ -46,9 +46,10 @@ LONGEST_BREAK = 200 * MS  #: A set stands over a break of this length, ns.
 #: Least error of the odd one in a set of several IMUs, or suspected, and of one that is
 #: compared with only one other IMU, in ``min_size``.
 VOTE = 2.0
-#: An IMU must be suspected, and the odd one, for this time, ns, and a difference that is younger
-#: than the name: the monitor takes 0.2 to 0.8 s to doubt the other IMU.
-SUSPECT_STANDS = NS
+SUSPECT_STANDS = NS  #: An IMU must be suspected, and the odd one, for this time, ns.
+#: A difference that is younger than the name must stand for this time, ns. The monitor doubts an IMU
+#: that is off by 0.1 rad/s after 0.06 to 0.12 s, and its states are up to 0.2 s old.
+DOUBT_TAKES = NS // 2
 #: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
 #: 0.2 s to exclude a spike. An autopilot whose primary gyro reads zero is at 50 deg then.
 CLEAR_DIFFERENCE = 0.5
@@ -192,7 +193,7 @@ def _note_apart(track: Track, least: float, now: int) -> None:
     for axis, size in enumerate(track.sizes):
         if axis not in faulty:
             track.unnamed_at[axis] = now
-        if not size >= least:
+        if size < least:
             track.near_at[axis] = now
 
 
@@ -528,7 +529,10 @@ class Evidence:
             needed = max(dead, min(SAME_TURN * wrong.rate, dead / wrong.share))
             if max(abs(turn[axis]), shakes[axis]) >= needed:
                 track.shown.add(axis)
-        return not track.waits if track.wrong else math.hypot(*turn) >= TURN_RATE
+        faulty = track.axes(ChannelState.FAULTY)
+        if track.wrong or faulty:
+            return not track.waits and faulty <= track.shown
+        return math.hypot(*turn) >= TURN_RATE
 
     def _partners(
         self, unit: int, units: Sequence[int], out: Sequence[int]
@@ -561,21 +565,23 @@ class Evidence:
         Of two IMUs either may be wrong, or both by less than ``min_size``. So the monitor must
         not doubt that axis of the other one, and the difference must be `VOTE` times as large.
         Of a name that is older than the difference, the monitor may have yet to doubt the other
-        one: the difference must stand for `SUSPECT_STANDS`.
+        one: the difference must stand for `DOUBT_TAKES`.
 
         witness: the only IMU with which this one could be compared, or None.
         """
         least = self._min_size
         if witness is not None:
             least *= VOTE
-            early = {
-                axis
-                for axis, near_at in enumerate(track.near_at)
-                if near_at - track.unnamed_at[axis] >= SET_STANDS
-                and now - near_at < SUSPECT_STANDS
-            }
-            axes = axes - self._tracks[witness].axes(*DOUBTS) - early
+            doubted = self._tracks[witness].axes(*DOUBTS)
+            axes = {k for k in axes - doubted if not self._is_early(track, k, now)}
         return any(track.sizes[axis] >= least for axis in axes)
+
+    def _is_early(self, track: Track, axis: int, now: int) -> bool:
+        """Return whether an axis was named before it was apart, and the other may be doubted yet."""
+        near_at = track.near_at[axis]
+        is_clear = track.sizes[axis] >= CLEAR_DIFFERENCE
+        takes = SET_STANDS if is_clear else DOUBT_TAKES
+        return near_at - track.unnamed_at[axis] >= SET_STANDS and now - near_at < takes
 
     def _is_trusted(self, unit: int) -> bool:
         return self._tracks[unit].refuted is not None
@@ -617,8 +623,8 @@ class Evidence:
     def _is_odd(self, unit: int, units: Sequence[int]) -> bool:
         """Return whether the two other IMUs agree, and nothing is against these two.
 
-        They are trusted, their values change, and every doubt that the monitor has of
-        them was refuted before, or is one that it has of this IMU too.
+        Their values change. If this IMU is not stuck, they are trusted, and every doubt that
+        the monitor has of them was refuted before, or is one that it has of this IMU too.
         """
         others = self._voters(unit, units)
         if not others:
@@ -627,9 +633,13 @@ class Evidence:
         between = max(self._pairs[others[0], others[1]].mean)
         if not between < max(self._min_size, ALIKE * size):
             return False
+        if any(self.raw.repeats(k, self.raw.fewest) for k in others):
+            return False
+        if self.raw.is_stuck(unit):
+            return True
         for k in others:
             refuted = self._tracks[k].refuted
-            if refuted is None or self.raw.repeats(k, self.raw.fewest):
+            if refuted is None:
                 return False
             if not self._tracks[k].doubts <= refuted | self._tracks[unit].doubts:
                 return False
@@ -659,8 +669,8 @@ class Evidence:
 
         Of three IMUs it is the one that is off by `CLEAR_DIFFERENCE` while the two others
         agree, or by less if the monitor doubts it or it is stuck. Otherwise it is the
-        only IMU with a set. If one of two others is not trusted, a set proves nothing:
-        two IMUs that fail alike put the healthy third one into a set.
+        only IMU with a set. If one of two others is not trusted, and this one is not stuck, a
+        set proves nothing: two IMUs that fail alike put the healthy third one into a set.
         """
         for k in units:
             if not self._is_odd(k, units):
@@ -686,9 +696,11 @@ class Evidence:
         found = [(k, axes, SET_STANDS) for k, axes in sets.items() if axes]
         if len(found) != 1:
             return NOBODY
-        voters = self._voters(found[0][0], units)
+        unit = found[0][0]
+        voters = self._voters(unit, units)
         trusted = voters and all(map(self._is_trusted, voters))
-        return found[0] if trusted or len(units) < 3 else NOBODY
+        sure = trusted or self.raw.is_stuck(unit) or len(units) < 3
+        return found[0] if sure else NOBODY
 
     def _clear_axes(self, unit: int, units: Sequence[int], now: int) -> set[int]:
         """Return the axes on which an IMU is far off from both others, in one direction.

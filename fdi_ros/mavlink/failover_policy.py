@@ -14,12 +14,13 @@ Definitions
     named    by the monitor, now or in its last report if that is not old, or by the raw
              rates: two of three IMUs agree, and the third is far off
     blamed   named on an axis that is apart. If only one other IMU can be compared: by twice
-             as much, for 1 s if the name is older than the difference, and the monitor does
+             as much, for 0.5 s if the name is older than that by 0.3 s, and the monitor does
              not doubt that axis of the other one. A name from before the IMU last agreed
              counts only while two of three IMUs agree, and this one does not
     bad      blamed, and delivers. Else left in use.
     alive    delivers samples, and they change while other IMUs turn
-    sound    alive, and the monitor finds it OK or it is not apart
+    sound    alive, and the monitor finds all its axes OK, or it is not apart
+    trusted  all IMUs have agreed for 2 s since it was last apart. A bad one in use prevents that
     ours     out of use by our order, or perhaps so: from the moment the order is sent
              until the autopilot reports "in use" `SETTLED` after it
     seen     INS_USE as reported. A change that we have not ordered counts once it has
@@ -125,7 +126,8 @@ class View(NamedTuple):
     linked: bool = False  #: An ArduPilot that sends SCALED_IMU is heard.
     armed: bool = False  #: By the last heartbeat, which may be 1 s old.
     disarmed: int = 0  #: How long all heartbeats have reported "disarmed".
-    monitored: bool = False  #: The right monitor is alive and has no imitator.
+    #: The right monitor has sent diagnostics in the last 5 s, and has no imitator.
+    monitored: bool = False
     boots: int = 0  #: Number of starts of the autopilot seen.
     restore: bool = False  #: The operator asks now to put all of ours back.
 
