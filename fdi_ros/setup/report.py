@@ -572,12 +572,15 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
 
 
 def _looks_of_proof(found: SetupResult, said: Collection[str]) -> Iterator[Finding]:
-    """Yield the reasons to look that a replay with these settings gives.
+    """Yield the reasons to look that the proof of the settings gives.
 
     What the whole recording shows by its topics, with advice that was ``said``, is not
     repeated for a part of it.
     """
     tried = found.proof.before if found.kept else found.proof.after
+    if not found.kept and (words := found.proof.worse_forces):
+        words = f"in {found.proof.source}, {words}"
+        yield Finding(Role.WARNING, "accelerometers", words, headline=LOOK)
     if tried.baseline is None:
         return
     source = source_of(found.config)

@@ -68,6 +68,8 @@ WITHIN, TIMES = (
     4.0,
     2,
 )
+#: fewer biases isolated than before that are chance: one at the edge of `WITHIN`
+CHANCE = 1
 #: part kept aside, and its bounds, s: all biases have room
 KEPT, LEAST_KEPT, MOST_KEPT = (
     0.25,
@@ -103,10 +105,13 @@ class Tried:
             self.declared.setdefault(event.channel, event.at_s)
             if event.reason == Reason.STUCK.value:
                 self.stuck.setdefault(event.channel, event.at_s)
-        # Biases isolated, and tried, of all sizes.
-        self.isolated_of = tuple(
-            map(sum, zip(*self.isolated.values(), strict=True))
-        ) or (0, 0)
+        self.isolated_of = _of_all_sizes(self.isolated)
+        self.forces_of = _of_all_sizes(self.forces)
+
+
+def _of_all_sizes(isolated: Mapping[float, tuple[int, int]]) -> tuple[int, int]:
+    """Return the number of biases isolated, and tried, of all sizes."""
+    return sum(n for n, _ in isolated.values()), sum(n for _, n in isolated.values())
 
 
 def times_words(declared: Mapping[str, float]) -> str:
@@ -147,10 +152,19 @@ class Proof:
         if before.judged - after.judged > 0.02:
             words = f"the new settings judge {percent(after.judged)} of the samples"
             return f"{words} instead of {percent(before.judged)}"
-        # One fewer is chance.
-        if tried_before == tried and was - now > 1:
+        if tried_before == tried and was - now > CHANCE:
             return f"the new settings isolate {now} of {tried} biases instead of {was}"
         return ""
+
+    @property
+    def worse_forces(self) -> str:
+        """Words for fewer biases of accelerometers isolated than before, or empty."""
+        was, tried_before = self.before.forces_of
+        now, tried = self.after.forces_of
+        if tried_before != tried or was - now <= CHANCE:
+            return ""
+        words = f"the new settings isolate {now} of {tried} biases of accelerometers"
+        return f"{words} instead of {was}"
 
 
 def _tried(block: Block, config: Config, start: float) -> Tried:

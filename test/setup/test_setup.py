@@ -33,7 +33,7 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.report.layout import RADIANS
 from fdi_ros.setup.agreement import find_mounts
 from fdi_ros.setup.blocks import prepare
-from fdi_ros.setup.report import _worth
+from fdi_ros.setup.report import _looks_of_proof, _worth
 from fdi_ros.setup.run import SIZES, Proof, Tried
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -295,6 +295,29 @@ def test_settings_are_never_worse_than_those_before():
         (nothing, before, ""),
     ):
         assert Proof("", True, 36.0, old, new).worse == worse
+
+
+@pytest.mark.parametrize(
+    ("now", "kept", "words"),
+    [
+        (
+            36,
+            "",
+            "the new settings isolate 36 of 54 biases of accelerometers instead of 54",
+        ),
+        (53, "", ""),
+        (36, "the new settings judge nothing", ""),
+    ],
+)
+def test_settings_that_isolate_fewer_faults_of_accelerometers_are_to_be_looked_at(
+    now, kept, words
+):
+    gyros = {0.1: (36, 36)}
+    before, after = (Tried(None, "", gyros, {1.0: (n, 54)}) for n in (54, now))
+    proof = Proof("the last 117 s", True, 117.0, before, after)
+    found = list(_looks_of_proof(SimpleNamespace(proof=proof, kept=kept), ()))
+    assert [one.words for one in found] == [f"in the last 117 s, {words}"] * bool(words)
+    assert {one.headline for one in found} <= {"USABLE, BUT LOOK"}
 
 
 def test_settings_that_are_worse_are_not_written(fdi, tmp_path, monkeypatch):
