@@ -18,7 +18,7 @@ from fdi_ros.core.sources import source_of
 from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.model.quantity import FORCE
 from fdi_ros.monitor.output import Topic
-from fdi_ros.monitor.soundness import Concern, Word, live_word
+from fdi_ros.monitor.soundness import DECLARED, Concern, Word, live_word
 from fdi_ros.system.text import figures, first_of, percent, plus_minus, shown
 
 if TYPE_CHECKING:
@@ -193,7 +193,11 @@ def describe(
     if warning:
         level = max(level, Level.WARN)
         message = f"{message}; {warning}"
-    word = Word.CANNOT_TELL if silent is not None else live_word(status, concerns)
+    word = live_word(status, concerns)
+    named = any(one.state in DECLARED for one in status.channels)
+    if silent is not None and not named:
+        # A fault that was declared does not end with the samples.
+        word = Word.CANNOT_TELL
     values = (("verdict", word.value), *_whole_values(status), *figures)
     rows = [(MONITOR_LINE, level, message, values)]
     for k, channel in enumerate(status.channels):
@@ -452,7 +456,7 @@ def _late(unit: UnitStatus) -> str:
     if not math.isfinite(unit.delay):
         return "none"
     if unit.name == unit.against:
-        return "0, the others are against it"
+        return "0 (reference of the other units)"
     return f"{1e3 * unit.delay:.2f} +- {1e3 * unit.delay_std:.2f}"
 
 

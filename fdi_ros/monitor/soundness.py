@@ -26,6 +26,8 @@ from fdi_ros.system.text import LINE, figures, listed, percent, shown
 if TYPE_CHECKING:
     from fdi_ros.monitor.status import ChannelStatus, Status
 
+DECLARED = (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
+"""States of a channel in a declared fault, named or in a set."""
 LEAST_CHECKED = 0.5
 """Share of its samples in which the others must have checked a healthy channel."""
 LEAST_DELIVERED = 0.9
@@ -329,8 +331,7 @@ def live_word(status: Status, concerns: Sequence[Concern]) -> Word:
 
 def is_declared_or_silent(channel: ChannelStatus) -> bool:
     """Whether a channel is declared faulty, alone or in a set, or is silent."""
-    declared = (ChannelState.FAULTY, ChannelState.AMBIGUOUS, ChannelState.STALE)
-    return channel.state in declared
+    return channel.state in (*DECLARED, ChannelState.STALE)
 
 
 def _rate_concerns(rate: RateHealth | None) -> list[Concern]:

@@ -129,6 +129,19 @@ def test_a_declared_fault_is_faulty_and_what_is_unchecked_cannot_be_told():
     assert dict(lines[0].values)["verdict"] == "CANNOT TELL"
 
 
+@pytest.mark.parametrize("state", [ChannelState.FAULTY, ChannelState.AMBIGUOUS])
+def test_a_declared_fault_stays_faulty_while_no_samples_arrive(state):
+    pipeline = Pipeline(parallel(3))
+    pipeline.process(healthy(2))
+    status = pipeline.status()
+    first, *others = status.channels
+    declared = replace(status, channels=(replace(first, state=state), *others))
+    for now, word in ((status, "CANNOT TELL"), (declared, "FAULTY")):
+        whole, *_ = describe(now, silent=5.5)
+        assert whole.message == "no sample for 5.5 s"
+        assert dict(whole.values)["verdict"] == word
+
+
 def test_a_channel_that_is_unchecked_now_is_not_called_healthy():
     pipeline = Pipeline(parallel(3))
     pipeline.process(healthy(2))
