@@ -110,9 +110,7 @@ FORCE_HINT = (
     "Relative to the mean of all accelerometers, because errors that all share do not show. With standard errors (+-)."
     " Nominal axes: those of the gyros, at right angles within a unit."
 )
-WARNINGS_HINT = (
-    "Those in the first line decide the verdict; look at the others when you can."
-)
+WARNINGS_HINT = "They do not decide the verdict; look at them when you can."
 BIAS_HINT = "Estimate over the recording, minus the mean of each channel. The common part is observable only at rest."
 
 
@@ -1008,7 +1006,9 @@ def _sections(
         f"fdi_node --ros-args --params-file {config}   # on the vehicle; in a workspace: ros2 run fdi_ros fdi_node ...",
     ]
     steps = [shown(line, LINE) for line in (steps[:1] if is_bad else steps)]
-    warnings = lines_of(findings, Role.WARNING)
+    # The first line has the others.
+    beside = [one for one in findings if one.words.removesuffix(".") not in first.words]
+    warnings = lines_of(beside, Role.WARNING)
     sections = [
         Section("Warnings", WARNINGS_HINT if warnings else "", warnings),
         Section(
