@@ -426,10 +426,11 @@ def run_fleet(arguments: Namespace) -> int:
         check_target(folder / PAGE, Kind.PAGE, force=True)
     tables = _judged(arguments, paths, workers)
     fleet = Fleet([tables.flights[storable(str(path))] for path in paths])
-    write_text(folder / PAGE, fleet.html(_about_fleet(arguments, len(paths))))
     notes = [f"Not searched: {shown(line)}." for line in unread]
     if others := len(tables.flights) - len(paths):
         notes.insert(0, f"The tables also hold {others} flights of earlier runs.")
+    about = _about_fleet(arguments, len(paths))
+    write_text(folder / PAGE, fleet.html(about, notes))
     text = fleet.text() + "".join(f"{line}\n" for line in notes)
     figures = fleet.figures() | {"not_searched": unread}
     code = outputs.finish(text, figures, severity=fleet.verdict.severity)

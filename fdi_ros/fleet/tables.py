@@ -39,7 +39,7 @@ from fdi_ros.report.layout import (
     told,
 )
 from fdi_ros.system.files import open_regular, plain, whole, write_text
-from fdi_ros.system.text import LINE, percent, shown, storable
+from fdi_ros.system.text import LINE, first_of, percent, shown, storable
 
 Row = Mapping[str, Any]
 """Values of a row by the names of the columns. None: unknown."""
@@ -295,6 +295,8 @@ MOST_TABLE_ROWS = 2000
 """Largest number of flights in a table of the page. flights.parquet has all."""
 LOOKS = 10
 """Largest number of flights with reasons that a terminal shows."""
+MOST_DAMAGED = 3
+"""Largest number of damaged recordings that a sentence names. The table has all."""
 
 
 class Fleet:
@@ -353,7 +355,11 @@ class Fleet:
             f"{_count(own['vehicles'], 'vehicle')}; {faults};"
             f" {own['watched'] / 3600:.2f} hours judged without a declared fault."
         )
-        damaged = f"{_count(own['damaged'], 'recording')} could not be read whole."
+        names = [row["path"].rpartition("/")[2] for row in self.judged if row["damage"]]
+        damaged = (
+            f"{_count(own['damaged'], 'recording')} could not be read whole:"
+            f" {shown(first_of(names, MOST_DAMAGED), LINE)}."
+        )
         assumed = (
             f"For {_count(own['not_measured'], 'flight')} the mounts and axes are assumed, not measured, so"
             " declarations may be wrong: give --config or --calibrate."
@@ -372,8 +378,11 @@ class Fleet:
         more = [f"and {hidden} more, in the page and tables"] if hidden > 0 else []
         return "".join(f"{line}\n" for line in [*self.lines(), *looks, *more])
 
-    def html(self, about: Mapping[str, str]) -> str:
-        """Lay out the page. ``about``: head of the page."""
+    def html(self, about: Mapping[str, str], notes: Sequence[str] = ()) -> str:
+        """Lay out the page.
+
+        ``about``: how the flights were judged. ``notes``: more sentences below the verdict.
+        """
         hint = "Gyros declared faulty first, then sets, then what was not judged, and what was hardly checked."
         sections = [
             _section("Flights that need a look", hint, self.looks),
@@ -386,7 +395,7 @@ class Fleet:
             Section("What was run", "", about),
         ]
         _, *others = self.lines()
-        return page("fdi_ros: fleet", [self.verdict, *others], sections)
+        return page("fdi_ros: fleet", [self.verdict, *others, *notes], sections)
 
 
 _CLASSES = ("FAULTY", "CANNOT TELL", "LOOK", "not judged")

@@ -207,7 +207,7 @@ def test_first_stands_what_needs_a_person(fleet, tmp_path, capsys):
     assert said[1].startswith(
         "2 vehicles; 1 fault declared, in 1 flight; 0.01 hours judged"
     )
-    assert said[2] == "1 recording could not be read whole."
+    assert said[2] == "1 recording could not be read whole: d.mcap."
     assert f"{fleet}/kite/c.mcap: FAULTY: imu_2.y from 5." in said[3]
     assert said[4].startswith(f"{fleet}/kite/e.mcap: could not be judged: ")
     figures = json.loads((tmp_path / "all.json").read_text())
@@ -239,6 +239,16 @@ def test_first_stands_what_needs_a_person(fleet, tmp_path, capsys):
         dies["why"][0],
     )
     assert [one["state"] for one in rows(tmp_path / "o", "episodes")] == ["STALE"]
+
+
+def test_a_file_that_is_passed_over_is_named_on_the_page_too(fleet, tmp_path, capsys):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.mcap").symlink_to(fleet / "heron" / "a.mcap")
+    (tmp_path / "in" / "no_log.bin").write_bytes(b"\x7fELF")
+    out = run(tmp_path / "out", tmp_path / "in", "--config", fleet / "config.yaml")
+    note = f"Not searched: {tmp_path}/in/no_log.bin is no flight log."
+    assert note in capsys.readouterr().out
+    assert note in (out / "fleet.html").read_text()
 
 
 def test_a_flight_is_said_to_be_what_its_replay_says_and_leads_to_its_page(
