@@ -17,8 +17,11 @@ from fdi_ros.config.config import Config
 from fdi_ros.core.messages import integrity_labels
 from fdi_ros.core.sources import ChannelsSource, ImuSource
 from fdi_ros.detectors import DETECTORS, detector_class
+from fdi_ros.detectors.sequential import Sequential
 from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.model.geometry import Geometry
+from fdi_ros.model.noise import NoiseModel
+from fdi_ros.model.quantity import FORCE
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import ChannelState, Reason
 from fdi_ros.monitor.pipeline import Pipeline
@@ -142,18 +145,18 @@ def test_the_fused_specific_force_is_as_far_off_as_its_covariance_says():
 TAKE_OFF, LANDING = 800, 2000  # samples
 
 
-def rectified(seed, vibration, shift, at_the_end=0.0):
+def rectified(seed, vibration, shift, at_the_end=0.0, length=2400):
     """A flight that shakes all units alike from take-off to landing, and moves every bias while it does, m/s^2.
 
     ``at_the_end``: what one bias moves by with the landing, and keeps.
     """
-    block, _ = flight(2400, seed=seed, scale=0.005, bias=0.1, size=0.5)
+    block, _ = flight(length, seed=seed, scale=0.005, bias=0.1, size=0.5)
     rng = np.random.default_rng(seed)
-    runs = np.zeros(2400)
+    runs = np.zeros(length)
     runs[TAKE_OFF:LANDING] = 1.0
-    runs = np.convolve(runs, np.full(50, 0.02))[:2400, None]
-    body = np.tile(rng.normal(0, vibration, (2400, 3)), 3)
-    own = rng.normal(0, 0.1 * vibration, (2400, 9)) + rng.normal(0, shift, 9)
+    runs = np.convolve(runs, np.full(50, 0.02))[:length, None]
+    body = np.tile(rng.normal(0, vibration, (length, 3)), 3)
+    own = rng.normal(0, 0.1 * vibration, (length, 9)) + rng.normal(0, shift, 9)
     force = block.acceleration.z + runs * (body + own)
     force[LANDING:, 4] += at_the_end
     return replace(block, acceleration=Block(block.stamp, force))
@@ -203,6 +206,39 @@ def test_a_fault_is_named_where_all_accelerometers_rectify_vibration(seed):
     assert named_in(output) == ["imu_2.accel_y"]
     first = next(event for event in output.events if event.after == ChannelState.FAULTY)
     assert (first.stamp - START) / 1e9 - 14 < 9.0
+
+
+@pytest.mark.parametrize(
+    ("vibration", "size", "within"), [(2.0, 3.0, 1.0), (5.0, 4.0, 18.0)]
+)
+def test_a_fault_that_begins_as_vibration_ends_is_named(vibration, size, within):
+    """A bias may have moved then, but not for the rest of the flight."""
+    pipeline = Pipeline(settings())
+    pipeline.sense(range(3))
+    block = rectified(3, vibration, 0.0, length=LANDING + 1800)
+    fault = f"channel=imu_2.accel_y kind=bias size={size} start={LANDING / 100}"
+    output = pipeline.process(struck(block, [fault], pipeline.channel_names))
+    assert named_in(output) == ["imu_2.accel_y"]
+    first = next(event for event in output.events if event.after == ChannelState.FAULTY)
+    assert (first.stamp - START) / 1e9 - LANDING / 100 < within
+
+
+@pytest.mark.parametrize("rate", [50.0, 100.0])
+def test_vibration_that_stays_the_same_does_not_change(rate):
+    """At 50 Hz a block is two samples, whose rate is always on a line."""
+    axes = np.tile(np.eye(3), (3, 1))
+    detector = Sequential(
+        Geometry(axes, units=[f"imu_{k // 3}" for k in range(9)]),
+        NoiseModel(0.2 / FORCE.natural, scale_std=0.01),
+        sample_rate=rate,
+        rectified=FORCE.rectified,
+    )
+    rng = np.random.default_rng(5)
+    shaken = rng.normal(0, 3.0, (int(20 * rate), 3)) @ axes.T
+    z = (shaken + rng.normal(0, 0.1, shaken.shape)) / FORCE.natural
+    for seconds in range(10, 20):
+        detector.detect(z[: int(seconds * rate)])
+        assert not detector.states[0]["estimator"]["vibration_changes"]
 
 
 def delays_of(half, units):
