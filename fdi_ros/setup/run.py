@@ -63,6 +63,9 @@ from fdi_ros.system.text import first_of, percent, shown
 #: biases of gyros tried, rad/s, and of accelerometers, m/s^2
 SIZES = (0.03, 0.1, 0.3)
 FORCE_SIZES = (0.3, 1.0, 3.0)
+#: size from which on biases of accelerometers count in a comparison, m/s^2: healthy ones
+#: move by 0.6 m/s^2 as vibration begins or ends
+FORCE_FLOOR = 1.0
 #: s in which they are to be isolated, and how often each is tried
 WITHIN, TIMES = (
     4.0,
@@ -106,7 +109,8 @@ class Tried:
             if event.reason == Reason.STUCK.value:
                 self.stuck.setdefault(event.channel, event.at_s)
         self.isolated_of = _of_all_sizes(self.isolated)
-        self.forces_of = _of_all_sizes(self.forces)
+        large = {size: n for size, n in self.forces.items() if size >= FORCE_FLOOR}
+        self.forces_of = _of_all_sizes(large)
 
 
 def _of_all_sizes(isolated: Mapping[float, tuple[int, int]]) -> tuple[int, int]:
@@ -163,8 +167,8 @@ class Proof:
         now, tried = self.after.forces_of
         if tried_before != tried or was - now <= CHANCE:
             return ""
-        words = f"the new settings isolate {now} of {tried} biases of accelerometers"
-        return f"{words} instead of {was}"
+        words = f"the new settings isolate {now} of {tried} biases of accelerometers of"
+        return f"{words} {FORCE_FLOOR:g} m/s^2 or more instead of {was}"
 
 
 def _tried(block: Block, config: Config, start: float) -> Tried:
