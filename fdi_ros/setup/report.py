@@ -570,7 +570,7 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
 
 
 def _looks_of_proof(found: SetupResult, said: Collection[str]) -> Iterator[Finding]:
-    """Yield the reasons to look that the proof of the settings gives.
+    """Yield the reasons to look that the proof and the next replay give.
 
     What the whole recording shows by its topics, with advice that was ``said``, is not
     repeated for a part of it.
@@ -583,18 +583,24 @@ def _looks_of_proof(found: SetupResult, said: Collection[str]) -> Iterator[Findi
         return
     source = source_of(found.config)
     topic_of = dict(zip(source.names, source.topics, strict=True))
-    for one in tried.baseline.judgement.concerns:
-        topics = [topic_of.get(name.partition(".")[0], name) for name in one.who]
-        if one.trouble.advice(topics) in said:
-            continue
-        yield Finding(
-            Role.WARNING,
-            "health",
-            f"in {found.proof.source}, {one}",
-            one.who,
-            headline=LOOK,
-            advice=one.advice,
-        )
+    known = set(said)
+    for part, baseline in (
+        (found.proof.source, tried.baseline),
+        ("a replay of the whole recording", found.replayed),
+    ):
+        for one in baseline.judgement.concerns if baseline is not None else ():
+            topics = [topic_of.get(name.partition(".")[0], name) for name in one.who]
+            if not known.isdisjoint((one.trouble.advice(topics), one.advice)):
+                continue
+            known.add(one.advice)
+            yield Finding(
+                Role.WARNING,
+                "health",
+                f"in {part}, {one}",
+                one.who,
+                headline=LOOK,
+                advice=one.advice,
+            )
 
 
 def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:

@@ -35,6 +35,7 @@ from fdi_ros.inspection.fitness import (
 from fdi_ros.inspection.starting_config import starting_config
 from fdi_ros.inspection.topics import GAP_INTERVALS, TopicReport, inspect
 from fdi_ros.model.samples import Block
+from fdi_ros.monitor.accelerometers import felt_units
 from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.outcomes import OutcomeKind
@@ -46,6 +47,7 @@ from fdi_ros.replay.sweep import (
     Subject,
     parse_swept,
     sweep,
+    watch_baseline,
 )
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.blocks import prepare
@@ -239,6 +241,8 @@ class SetupResult(LearnedSettings):
     mounting: Mounting
     #: performance of the settings
     proof: Proof
+    #: replay of the whole recording with the config, None if not judged
+    replayed: Baseline | None = None
     #: of all topics
     reports: Sequence[TopicReport] = ()
     damage: tuple[str, ...] = ()
@@ -333,7 +337,27 @@ def set_up(
         return before, _with_mounts(part, before, reference)
 
     found = _proved(block, bag, start, end, proof, learn)
-    return replace(found, reports=reports, damage=damage, unread=unread, chosen=chosen)
+    return replace(
+        found,
+        reports=reports,
+        damage=damage,
+        unread=unread,
+        chosen=chosen,
+        replayed=_replayed(bag, found.config, start, end),
+    )
+
+
+def _replayed(bag: Path, config: Config, start: float, end: float) -> Baseline | None:
+    """Replay the recording with the config that is written, as `fdi replay` will."""
+    try:
+        block = read_block(bag, config, start, end)
+        pipeline = Pipeline.from_config(config)
+        if config.has_units and config.accelerometers.enabled == "auto":
+            pipeline.sense(felt_units(block))
+        return watch_baseline(pipeline, pipeline.arranged(block), start)
+    except FdiError:
+        # The proof has the reason.
+        return None
 
 
 def recalibrate(

@@ -30,6 +30,7 @@ from fdi_ros.inspection.findings import Finding, Role, lines_of, verdict_of
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.building import build_geometry
 from fdi_ros.monitor.pipeline import Pipeline
+from fdi_ros.monitor.soundness import Concern, Trouble, Word
 from fdi_ros.report.layout import RADIANS
 from fdi_ros.setup.agreement import find_mounts
 from fdi_ros.setup.blocks import prepare
@@ -324,6 +325,24 @@ def test_settings_that_isolate_fewer_faults_of_accelerometers_are_to_be_looked_a
     found = list(_looks_of_proof(SimpleNamespace(proof=proof, kept=kept), ()))
     assert [one.words for one in found] == [f"in the last 117 s, {words}"] * bool(words)
     assert {one.headline for one in found} <= {"USABLE, BUT LOOK"}
+
+
+def test_what_the_next_replay_warns_of_is_a_warning_of_set_up_once():
+    spiky = Concern(Word.LOOK, Trouble.SPIKES, ("imu_1.x",), "has 3 spikes")
+    noisy = Concern(Word.LOOK, Trouble.NOISE, ("imu_2.y",), "is noisy")
+    part, whole = (
+        SimpleNamespace(judgement=SimpleNamespace(concerns=some))
+        for some in ([noisy], [noisy, spiky])
+    )
+    proof = SimpleNamespace(
+        source="the last 9 s", after=SimpleNamespace(baseline=part), worse_forces=""
+    )
+    config = Config.from_file(ROOT / "config" / "two_imus.yaml")
+    found = SimpleNamespace(proof=proof, kept="", config=config, replayed=whole)
+    assert [one.words for one in _looks_of_proof(found, ())] == [
+        "in the last 9 s, imu_2.y is noisy",
+        "in a replay of the whole recording, imu_1.x has 3 spikes",
+    ]
 
 
 def test_settings_that_are_worse_are_not_written(fdi, tmp_path, monkeypatch):
