@@ -74,7 +74,7 @@ STEADY = 0.5
 """Least mean rate over the mean of its size, of a turn whose axis hardly moves. In any other a wrong
 range is no constant error, but explains the mean of a slow drift by chance: with it, a drift of
 0.02 deg/s^2 of one gyro of six is named after 1 500 s in place of 240."""
-SHOWN = 0.9
+SHOWN_SHARE = 0.9
 """Least fused mean rate over the smaller reading of the turn that a wrong range assumes: the fused
 rate lies between both readings. At rest a fault of one channel is an apparent rate in its first
 samples, and without this bound a turn that nothing shows stands beside its name for 2 s."""
@@ -535,7 +535,7 @@ def add_ranges(
     for gain in RANGES:
         set_range(params, inference, inside, gain)
         inference.fit = inference.total - rest_of_range(params, inference)
-        shown = SHOWN * min(gain, 1.0)
+        shown = SHOWN_SHARE * min(gain, 1.0)
         assumed = dot(inference.amplitude, inference.amplitude, 3)
         if square(inference.rate) < shown * shown * assumed:
             continue

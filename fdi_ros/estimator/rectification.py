@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Moves of the biases of accelerometers by vibration.
+"""How far a healthy bias may have moved: slowly in flight, or by vibration.
 
 Every accelerometer rectifies vibration in its own way: its bias moves as the vibration
 begins or ends, at once or as the sensor warms. A fault that begins with such a change must

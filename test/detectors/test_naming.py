@@ -27,7 +27,7 @@ from fdi_ros.detectors.naming import (
     SHIFTED,
     SHIFTED_AMONG_FEW,
     SHIFTS,
-    SHOWN,
+    SHOWN_SHARE,
     SMALLEST_SHIFT,
     TWO_CHECKS,
     Inference,
@@ -180,7 +180,7 @@ def take_ranges(mean, inside, prior, found):
         rate, log_density = log_likelihood(gain)
         # Neither unit would show so little of the turn.
         smaller = min(gain, 1.0) * np.linalg.norm(rate)
-        if np.linalg.norm(mean.own["rate"]) < SHOWN * smaller:
+        if np.linalg.norm(mean.own["rate"]) < SHOWN_SHARE * smaller:
             continue
         # A prior that is flat in the rate times the root of the gain.
         explained = log_density - healthy + 1.5 * np.log(gain)
