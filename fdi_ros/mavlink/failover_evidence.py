@@ -353,29 +353,35 @@ class Evidence:
                 self._note_wrong(track, partners[k], axes)
             elif agreed is not None and now - agreed >= HEALED:
                 track.wrong.clear()
-            is_unknown = not track.states and k != odd
-            stuck = self.raw.is_stuck(k)
-            imus.append(
-                Imu(
-                    named=None if is_unknown else bool(faulty or k == odd),
-                    blamed=blamed,
-                    ok=track.is_ok and not stuck,
-                    delivers=delivers[k],
-                    stuck=stuck,
-                    size=max(track.sizes),
-                    least=self._least(k, units),
-                    agreed=agreed,
-                    votes=k not in self._once_bad,
-                    waits="".join(AXES[axis] for axis in sorted(track.waits)),
-                    unjudged="".join(
-                        axis
-                        for axis, at in zip(AXES, track.judged_at, strict=True)
-                        if now - at >= JUDGED_FOR
-                    ),
-                )
+            is_known = track.states or k == odd
+            found_now = Imu(
+                named=bool(faulty or k == odd) if is_known else None,
+                blamed=blamed,
+                delivers=delivers[k],
+                least=self._least(k, units),
+                agreed=agreed,
             )
+            imus.append(self._described(k, found_now, now))
         self.imus = tuple(imus)
         return self.imus
+
+    def _described(self, unit: int, found: Imu, now: int) -> Imu:
+        """Add to what was found of an IMU what is remembered of it."""
+        track = self._tracks[unit]
+        stuck = self.raw.is_stuck(unit)
+        unjudged = (
+            axis
+            for axis, at in zip(AXES, track.judged_at, strict=True)
+            if now - at >= JUDGED_FOR
+        )
+        return found._replace(
+            ok=track.is_ok and not stuck,
+            stuck=stuck,
+            size=max(track.sizes),
+            votes=unit not in self._once_bad,
+            waits="".join(AXES[axis] for axis in sorted(track.waits)),
+            unjudged="".join(unjudged),
+        )
 
     def _lasting_odd_one(self, units: Sequence[int], now: int) -> tuple[int, set[int]]:
         """Return the IMU that has been the odd one for long enough, and its axes, or `NOBODY`."""
