@@ -571,7 +571,8 @@ class Evidence:
         Of two IMUs either may be wrong, or both by less than ``min_size``. So the monitor must
         not doubt that axis of the other one, and the difference must be `VOTE` times as large.
         Of a name that is older than the difference, the monitor may have yet to doubt the other
-        one: the difference must stand for `DOUBT_TAKES`.
+        one: the difference must stand for `DOUBT_TAKES`, or for `SET_STANDS` from
+        `CLEAR_DIFFERENCE` on.
 
         witness: the only IMU with which this one could be compared, or None.
         """

@@ -14,9 +14,10 @@ Definitions
     named    by the monitor, now or in its last report if that is not old, or by the raw
              rates: two of three IMUs agree, and the third is far off
     blamed   named on an axis that is apart. If only one other IMU can be compared: by twice
-             as much, for 0.5 s if the name is older than that by 0.3 s, and the monitor does
-             not doubt that axis of the other one. A name from before the IMU last agreed
-             counts only while two of three IMUs agree, and this one does not
+             as much, for 0.5 s if the name is older than that by 0.3 s (for 0.3 s from
+             0.5 rad/s on), and the monitor does not doubt that axis of the other one. A name
+             from before the IMU last agreed counts only while two of three IMUs agree, and
+             this one does not
     bad      blamed, and delivers. Else left in use.
     alive    delivers samples, and they change while other IMUs turn
     sound    alive, and the monitor finds all its axes OK, or it is not apart
