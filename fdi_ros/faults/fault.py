@@ -11,6 +11,7 @@ blocks; a live stream has one sample per block.
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -157,7 +158,10 @@ def fault_from(items: Mapping[str, Any]) -> Fault:
     for name in ("channel", "kind"):
         if not isinstance(items.get(name), str) or not items[name]:
             words = " ".join(f"{key}={value}" for key, value in items.items())
-            raise FaultError(f"fault needs {name}=..., got: {words}")
+            others = [str(key) for key in items if key not in _KEYS]
+            close = difflib.get_close_matches(name, others, n=1)
+            hint = f"; did you mean {name!r} instead of {close[0]!r}?" if close else ""
+            raise FaultError(f"fault needs {name}=..., got: {words}{hint}")
     when = {name: items[name] for name in _KEYS[2:] if name in items}
     # A key of a YAML file may be anything.
     options = {str(name): value for name, value in items.items() if name not in _KEYS}

@@ -237,6 +237,8 @@ def test_the_cut_of_the_stream_changes_nothing(kinds, cuts):
             "expected blanks between, 'channel=imu_1.x kind=bias size=1'",
         ),
         ("channel=imu_1.x kind=bias sise=1", "did you mean 'size'?"),
+        ("chanel=imu_1.x kind=bias", "did you mean 'channel' instead of 'chanel'?"),
+        ("channel=imu_1.x kid=bias", "did you mean 'kind' instead of 'kid'?"),
     ],
 )
 def test_a_wrong_fault_is_refused_in_one_line(text, words):
