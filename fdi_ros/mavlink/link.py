@@ -1,27 +1,20 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bytes from and to an autopilot over UDP, TCP or a serial line, and MAVLink 2 signatures.
+"""Bytes from and to an autopilot over UDP, TCP or a serial line.
 
 A link never waits. A lost one is opened again. All buffers are bounded. Only the standard
 library is used, and pyserial for serial lines. pymavlink's own connections wait, print and
 end processes.
-
-pymavlink checks signatures unsafely: the time in a message is kept before the signature is
-checked, so one forged late message locks the true sender out, and forged link ids fill the
-memory. `Verifier` replaces that check.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
-import hmac
 import os
 import select
 import socket
-import stat
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -29,7 +22,6 @@ from typing import Any
 from fdi_ros.errors import FdiError
 from fdi_ros.mavlink.protocol import NS
 from fdi_ros.system import require
-from fdi_ros.system.files import open_regular
 
 MOST_AT_ONCE = 1 << 15  #: Bytes read before others get their turn.
 MOST_WAITING = 1 << 12  #: Bytes that may wait to be sent: half a second of a slow line.
@@ -228,78 +220,3 @@ def open_link(url: str) -> Link:
         if kind == "tcp"
         else Udp(url, make, None if kind == "udpin" else to)
     )
-
-
-#: Length of a key of MAVLink 2, bytes.
-KEY_BYTES = 32
-BLOCK = 13  #: Bytes of a signature: link id, time, and 6 of the digest.
-EPOCH = 1_420_070_400  #: Unix time from which signatures count, s: 2015.
-STEPS_PER_SECOND = 100_000  #: Steps of time in a second.
-LARGEST_LAG = 60 * STEPS_PER_SECOND  #: Largest delay of a new sender, steps.
-_SENDERS = 16  # largest number of links of the autopilot
-
-
-def now_in_steps(seconds: float) -> int:
-    """Return the time of a signature for a Unix time."""
-    return max(0, round((seconds - EPOCH) * STEPS_PER_SECOND))
-
-
-def read_key(path: str) -> bytes:
-    """Return a key of 32 bytes or 64 hexadecimal digits. Raises `FdiError` if others can read the file."""
-    try:
-        with open_regular(path) as file:
-            about = os.fstat(file.fileno())
-            if (
-                about.st_uid not in (0, os.geteuid())
-                or stat.S_IMODE(about.st_mode) & 0o077
-            ):
-                raise FdiError(
-                    f"signing_key {path} can be read by others: chmod 600 it, and let this user own it"
-                )
-            data = file.read(4096)
-    except OSError as error:
-        raise FdiError(f"cannot read signing_key {path}: {error.strerror}") from error
-    if len(data) == KEY_BYTES:
-        return data
-    try:
-        key = bytes.fromhex(data.decode("ascii").strip())
-    except ValueError:
-        key = b""
-    if len(key) != KEY_BYTES:
-        raise FdiError(
-            f"signing_key {path} is no key: expected 32 bytes, or 64 hexadecimal digits"
-        )
-    return key
-
-
-class Verifier:
-    """Checks signatures made with a key of 32 bytes, and refuses repeated messages."""
-
-    def __init__(self, key: bytes) -> None:
-        self._key = key
-        # Time of the last message by link id, system and component.
-        self._latest: dict[tuple[int, int, int], int] = {}
-        self.behind = (
-            0.0  #: Delay of the last message if rightly signed but too old, s.
-        )
-
-    def accepts(self, message: bytes, system: int, component: int, now: int) -> bool:
-        """Return whether a message is rightly signed and new. now: present time in steps."""
-        self.behind = 0.0
-        if len(message) < BLOCK + 12 or message[0] != 0xFD or not message[2] & 1:
-            return False
-        digest = hashlib.sha256(self._key + message[:-6]).digest()[:6]
-        if not hmac.compare_digest(digest, message[-6:]):
-            return False
-        time = int.from_bytes(message[-12:-6], "little")
-        sender = (message[-BLOCK], system, component)
-        if sender in self._latest:
-            if time <= self._latest[sender]:
-                return False
-        elif time < now - LARGEST_LAG:
-            self.behind = (now - time) / STEPS_PER_SECOND
-            return False
-        elif len(self._latest) >= _SENDERS:
-            return False
-        self._latest[sender] = time
-        return True

@@ -62,7 +62,10 @@ class Reporter:
             refused = recent.get("unsigned", 0)
             why = f"; {refused} messages without a valid signature" if refused else ""
             if recent.get("signed late"):
-                why = f"; rightly signed messages, but {vehicle.behind:.0f} s old by this computer's clock: set either"
+                why = (
+                    f"; rightly signed messages, but {vehicle.behind:.0f} s older than"
+                    " expected: repeated, or the clock of one side is wrong"
+                )
             wanted = (
                 f" of system {vehicle.settings.system}"
                 if vehicle.settings.system

@@ -20,7 +20,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from fdi_ros.mavlink.link import Verifier, now_in_steps
 from fdi_ros.mavlink.protocol import (
     ARDUPILOT,
     DEFAULT_INTERVAL,
@@ -41,6 +40,7 @@ from fdi_ros.mavlink.protocol import (
     read,
     understood,
 )
+from fdi_ros.mavlink.signing import NO_TIMES, SigningTimes, Verifier, now_in_steps
 from fdi_ros.system import require
 
 HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
@@ -120,6 +120,8 @@ class Vehicle:
         Takes the bytes of a message and their destination.
     seconds
         Unix time, s, for signatures.
+    times
+        Times of signed messages before this start.
     """
 
     def __init__(
@@ -127,6 +129,7 @@ class Vehicle:
         settings: VehicleSettings,
         send: Callable[[bytes, Any], None],
         seconds: Callable[[], float],
+        times: SigningTimes = NO_TIMES,
     ) -> None:
         self.settings = settings
         self.system = settings.system or None  #: System id in use. None: none yet.
@@ -147,7 +150,7 @@ class Vehicle:
         self._mavlink = dialect()
         self._send = send
         self._seconds = seconds
-        self._verifier = Verifier(settings.key) if settings.key else None
+        self._verifier = Verifier(settings.key, times) if settings.key else None
         self._parsers: dict[Any, Any] = {}
         # Before an autopilot is known, messages are sent as system 1.
         self._out = self._mavlink.MAVLink(
@@ -156,7 +159,6 @@ class Vehicle:
         if settings.key:
             self._out.signing.secret_key = settings.key
             self._out.signing.sign_outgoing = True
-            self._out.signing.timestamp = now_in_steps(seconds())
         self._beat = 0  # time of the last heartbeat sent, ns
         self._scaled_at = 0  # last arrival or request of SCALED_IMU of IMU 1, ns
         self._sequence: int | None = None
@@ -208,18 +210,13 @@ class Vehicle:
         header = 10 if data[0] == 0xFD else 6
         sequence, system, component = data[4:7] if header == 10 else data[2:5]
         self.counts["messages"] += 1
-        if self._verifier is not None and not self._verifier.accepts(
-            data, system, component, now_in_steps(self._seconds())
-        ):
+        if self._is_forged(data, system, component, peer):
             self.counts["unsigned"] += 1
-            if self._verifier.behind:
-                self.counts["signed late"] += 1
-                self.behind = self._verifier.behind
-                self._behind_from = peer
         elif number == self._mavlink.MAVLINK_MSG_ID_UNKNOWN:
             # Of another dialect: the checksum depends on the unknown layout.
             self.counts["unknown"] += 1
-            if self._sequence is not None and sequence == (self._sequence + 1) & 255:
+            is_ours = (system, component) == (self.system, AUTOPILOT_COMPONENT)
+            if is_ours and self._sequence == (sequence - 1) & 255:
                 self._sequence = sequence
         elif self._is_from_autopilot(message, number, system, component, peer, now):
             is_new = self._count_lost(sequence)
@@ -227,6 +224,28 @@ class Vehicle:
                 return self._sample(number, data[header : header + data[1]], now)
             self._hear(message, number, is_new, now)
         return None
+
+    def _is_forged(self, data: bytes, system: int, component: int, peer: Any) -> bool:
+        """Return whether a message is in the autopilot's name and is not rightly signed.
+
+        Others are not heard. They may have the key too, and would take up the room for the
+        links of the autopilot.
+        """
+        verifier = self._verifier
+        may_be_heard = component == AUTOPILOT_COMPONENT and self.settings.system in (
+            0,
+            system,
+        )
+        if verifier is None or not may_be_heard:
+            return False
+        now = now_in_steps(self._seconds())
+        if verifier.accepts(data, system, component, now):
+            return False
+        if verifier.behind:
+            self.counts["signed late"] += 1
+            self.behind = verifier.behind
+            self._behind_from = peer
+        return True
 
     def _hear(self, message: Any, number: int, is_new: bool, now: int) -> None:
         """Take an answer. is_new: it has overtaken no other message."""
@@ -513,13 +532,25 @@ class Vehicle:
     def _say(self, name: str, *fields: Any) -> None:
         """Send a message of the dialect."""
         out = self._out
-        out.signing.timestamp = max(
-            out.signing.timestamp, now_in_steps(self._seconds())
-        )
+        if self._verifier is not None:
+            # An autopilot whose clock is ahead of this one refuses older messages.
+            out.signing.timestamp = max(
+                out.signing.timestamp,
+                self._verifier.newest,
+                now_in_steps(self._seconds()),
+            )
         data = getattr(out, f"{name}_encode")(*fields).pack(out)
         out.seq = (out.seq + 1) % 256
         # Our signed messages set an autopilot whose signing clock is behind.
         self._send(bytes(data), self._behind_from if self.peer is None else self.peer)
+
+    @property
+    def signing_times(self) -> SigningTimes:
+        """Times of signed messages until now."""
+        if self._verifier is None:
+            return NO_TIMES
+        newest = max(self._out.signing.timestamp, self._verifier.newest)
+        return SigningTimes(newest, self._verifier.latest)
 
     @property
     def in_reach(self) -> bool:

@@ -39,9 +39,10 @@ from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
 from fdi_ros.mavlink.failover_policy import PolicySettings
 from fdi_ros.mavlink.failover_ready import INS_USE
-from fdi_ros.mavlink.link import open_link, read_key
+from fdi_ros.mavlink.link import open_link
 from fdi_ros.mavlink.protocol import ImuSample, Thinning, system_ahead
 from fdi_ros.mavlink.report import Announcer, Reporter
+from fdi_ros.mavlink.signing import NO_TIMES, SigningFile, read_key
 from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import (
     DIAGNOSTICS,
@@ -85,7 +86,9 @@ class AutopilotNode(CheckedNode):
         config = self.config
         settings = self._settings(params)
         self._link = open_link(params["url"])
-        self._vehicle = Vehicle(settings, self._link.send, time.time)
+        self._signing = self._keep_signing_times(params, settings.key)
+        times = NO_TIMES if self._signing is None else self._signing.written
+        self._vehicle = Vehicle(settings, self._link.send, time.time, times)
         names = config.imu_names if config.has_units else NAMES
         topics = (
             config.topics
@@ -149,6 +152,28 @@ class AutopilotNode(CheckedNode):
             params["system_id"], params["component_id"], kind, rate, key
         )
 
+    def _state_path(self, params: dict[str, Any], kind: str) -> Path:
+        """Return the path of a file that outlives a restart, in the folder of such files."""
+        if given := params["failover_file"]:
+            folder = Path(given).expanduser().parent
+        else:
+            folder = Path(os.environ.get("ROS_HOME", "~/.ros")).expanduser()
+            # Without the folder the file is not usable, and its owner says so.
+            with contextlib.suppress(OSError):
+                folder.mkdir(parents=True, exist_ok=True)
+        name = self.get_fully_qualified_name().strip("/").replace("/", "_")
+        return folder / f"{name}_{kind}.json"
+
+    def _keep_signing_times(
+        self, params: dict[str, Any], key: bytes
+    ) -> SigningFile | None:
+        if not key:
+            return None
+        file = SigningFile(self._state_path(params, "signing"), key)
+        if file.trouble:
+            self.get_logger().warning(file.trouble)
+        return file
+
     def _make_failover(self, params: dict[str, Any]) -> Failover:
         units = len(self.config.topics)
         if (
@@ -164,14 +189,10 @@ class AutopilotNode(CheckedNode):
             raise ConfigError(
                 f"failover_limit is {params['failover_limit']}, expected 0 to {units - 1}"
             )
-        path = Path(
-            params["failover_file"] or os.environ.get("ROS_HOME", "~/.ros")
-        ).expanduser()
-        if not params["failover_file"]:
-            # Without the folder the file is not usable, and failover says so.
-            with contextlib.suppress(OSError):
-                path.mkdir(parents=True, exist_ok=True)
-            path /= f"{self.get_fully_qualified_name().strip('/').replace('/', '_')}_failover.json"
+        given = params["failover_file"]
+        path = (
+            Path(given).expanduser() if given else self._state_path(params, "failover")
+        )
         declarations = f"/{self._monitor}/{INTEGRITY.topic.name.rpartition('/')[2]}"
         kind = message_class(INTEGRITY.topic.type)
         heard = self.create_subscription(
@@ -241,6 +262,10 @@ class AutopilotNode(CheckedNode):
         if self._failover is not None:
             self._failover.turn(now)
         self._vehicle.tick(now)
+        if self._signing is not None:
+            trouble = self._signing.keep(self._vehicle.signing_times, now)
+            if trouble:
+                self.log.warning(trouble)
         while self._vehicle.events:
             self.log.info(self._vehicle.events.popleft())
 
@@ -356,11 +381,12 @@ class AutopilotNode(CheckedNode):
     def destroy_node(self) -> None:
         """Close the link too."""
         self._link.close()
-        if self._failover is not None:
-            try:
-                self._failover.close()
-            except ConfigError as error:
-                self.get_logger().error(str(error))
+        for kept in (self._failover, self._signing):
+            if kept is not None:
+                try:
+                    kept.close()
+                except ConfigError as error:
+                    self.get_logger().error(str(error))
         super().destroy_node()
 
 

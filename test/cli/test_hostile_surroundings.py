@@ -17,7 +17,7 @@ import pytest
 
 from fdi_ros.errors import FdiError
 from fdi_ros.fleet.tables import Tables
-from fdi_ros.mavlink.link import read_key
+from fdi_ros.mavlink.signing import read_key
 from fdi_ros.system.files import (
     JUST_MADE,
     replacing,

@@ -36,8 +36,8 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fdi_ros.mavlink.link import now_in_steps
 from fdi_ros.mavlink.protocol import ImuSample
+from fdi_ros.mavlink.signing import NO_TIMES, SigningTimes, now_in_steps
 from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 
 NS = 1_000_000_000
@@ -431,6 +431,7 @@ class Conversation:
         latency: Callable[[], int] = lambda: 3_000_000,
         peers: tuple[Any, ...] = (),
         may_set: bool = False,
+        times: SigningTimes = NO_TIMES,
         **settings,
     ) -> None:
         self.now = 1000 * NS
@@ -443,7 +444,7 @@ class Conversation:
         self.sent: Counter[str] = Counter()
         self.sent_to: Counter[Any] = Counter()
         settings = VehicleSettings(**{"rate": 50.0, "kind": "SCALED_IMU", **settings})
-        self.vehicle = Vehicle(settings, self._send, self.unix)
+        self.vehicle = Vehicle(settings, self._send, self.unix, times)
         self.samples: list[tuple[int, ImuSample]] = []
         """With the time at which each came out, ns."""
         self.cut = False

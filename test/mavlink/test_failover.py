@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from fdi_ros.errors import ConfigError
-from fdi_ros.mavlink import failover_file
+from fdi_ros.mavlink import kept_file
 from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
 from fdi_ros.mavlink.failover_file import FailoverFile
 from fdi_ros.mavlink.failover_policy import PolicySettings
@@ -789,13 +789,13 @@ def test_a_slow_disk_holds_up_no_order(
 ) -> None:
     """A card may take seconds to sync: the write of the file waits, the link does not."""
     release = threading.Event()
-    whole = failover_file.replacing
+    whole = kept_file.replacing
 
     def slow(path: Path):
         release.wait(10.0)
         return whole(path)
 
-    monkeypatch.setattr(failover_file, "replacing", slow)
+    monkeypatch.setattr(kept_file, "replacing", slow)
     flying.waits_for_disk = False
     flying.fault(1, 0.5, seconds=1.0)
     assert flying.in_use == [False, True, True]
@@ -1505,8 +1505,8 @@ def test_a_disk_that_never_answers_holds_up_neither_start_nor_end(
         release.wait()
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    monkeypatch.setattr(failover_file, "replacing", never)
-    monkeypatch.setattr(failover_file, "LONGEST_END", 0.01)
+    monkeypatch.setattr(kept_file, "replacing", never)
+    monkeypatch.setattr(kept_file, "LONGEST_END", 0.01)
     talk = Monitored(tmp_path, Autopilot("ardupilot"))
     talk.waits_for_disk = False
     talk.run(12.0)
@@ -1569,12 +1569,12 @@ def test_a_full_disk_at_a_start_in_flight_ends_nothing(
     autopilot = flying.autopilots[0]
     flying.fault(1, 0.3, seconds=1.0)
     flying.failover.close()
-    whole = failover_file.replacing
+    whole = kept_file.replacing
 
     def full(path: Path):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(failover_file, "replacing", full)
+    monkeypatch.setattr(kept_file, "replacing", full)
     boot, start = autopilot.boot, autopilot.start
     again = Monitored(tmp_path, autopilot)
     again.now, autopilot.boot, autopilot.start = flying.now, boot, start
@@ -1586,7 +1586,7 @@ def test_a_full_disk_at_a_start_in_flight_ends_nothing(
     again.heal(1, 8.0)
     assert again.in_use == [True] * 3
     assert reason(again) == "no failover: failover_file is not usable"
-    monkeypatch.setattr(failover_file, "replacing", whole)
+    monkeypatch.setattr(kept_file, "replacing", whole)
     assert until(again, lambda: reason(again) == "ready")
     assert kept(again, tmp_path, ())[1] == []
 

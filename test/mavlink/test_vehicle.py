@@ -3,6 +3,7 @@
 
 """The conversation with simulated autopilots: what comes out, what is asked for, and what is refused."""
 
+import json
 import re
 import struct
 from collections.abc import Callable
@@ -16,8 +17,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.errors import FdiError
-from fdi_ros.mavlink.link import open_link, read_key
+from fdi_ros.mavlink.link import open_link
 from fdi_ros.mavlink.report import Reporter
+from fdi_ros.mavlink.signing import SigningFile, SigningTimes, now_in_steps, read_key
 from mavlink.autopilots import NS, UTC, Autopilot, Conversation
 
 MS = 1_000_000
@@ -332,12 +334,161 @@ def test_an_autopilot_whose_signatures_are_behind_is_told_the_time() -> None:
         .message
     )
     assert re.search(
-        r"rightly signed messages, but 864\d\d s old by this computer's clock", said
+        r"rightly signed messages, but 864\d\d s older than expected", said
     ), said
     assert autopilot.inbound.signing.goodsig_count > 1
     autopilot.mav.signing.timestamp = autopilot.inbound.signing.timestamp
     talk.run(6.0)
     check_flight(talk)
+
+
+def test_what_was_signed_before_a_restart_is_refused_after_it(tmp_path: Path) -> None:
+    """A replayed message must be newer than any that came before the node was stopped."""
+    autopilot = Autopilot("px4", key=KEY, utc=UTC + 1000)
+    before = Conversation(autopilot, key=KEY)
+    recorded: list[bytes] = []
+    whole = autopilot.step
+    autopilot.step = lambda now: recorded.extend(sent := whole(now)) or sent
+    before.run(6.0)
+    file = SigningFile(tmp_path / "signing.json", KEY)
+    file.keep(before.vehicle.signing_times, before.now)
+    file.close()
+
+    times = SigningFile(tmp_path / "signing.json", KEY).written
+    after = Conversation(key=KEY, times=times)
+    after.now = before.now + 40 * NS
+    for data in recorded:
+        after.inject(data)
+    assert after.vehicle.system is None
+    assert not after.samples
+    # The autopilot itself is heard: its times go on.
+    autopilot.step = whole
+    again = Conversation(autopilot, key=KEY, times=times)
+    again.now, autopilot.boot, autopilot.start = (
+        before.now,
+        autopilot.boot - again.now,
+        autopilot.start - again.now,
+    )
+    check_flight(again.run(6.0))
+
+
+def test_a_companion_whose_clock_is_behind_knows_the_time_from_before_its_restart() -> (
+    None
+):
+    """Without a time source, a link id not heard before would be taken with any time."""
+    day = 86_400 * 100_000
+    newest = now_in_steps(UTC + 1000) + day
+    talk = Conversation(key=KEY, times=SigningTimes(newest))
+    old = mavlink.MAVLink(None, 1, 1)
+    old.signing.secret_key, old.signing.sign_outgoing = KEY, True
+    old.signing.link_id, old.signing.timestamp = 7, newest - day // 2
+    talk.inject(bytes(old.heartbeat_encode(2, 12, 0, 0, 4).pack(old)))
+    assert talk.vehicle.system is None
+    assert talk.vehicle.behind == pytest.approx(43_200, abs=1)
+    # What we sign goes on from there, else the autopilot would refuse it.
+    talk.run(1.1)
+    assert talk.vehicle.signing_times.newest > newest
+
+
+def test_an_autopilot_whose_clock_is_ahead_takes_our_messages() -> None:
+    """A companion without a time source may be years behind the GPS of the autopilot."""
+    year = 365 * 86_400
+    autopilot = Autopilot("px4", key=KEY, utc=UTC + 1000 + year)
+    check_flight(Conversation(autopilot, key=KEY).run(6.0))
+    assert autopilot.inbound.signing.goodsig_count > 10
+
+
+def test_others_with_the_key_do_not_take_up_the_room_for_the_autopilot() -> None:
+    autopilot = Autopilot("px4", key=KEY, utc=UTC + 1000)
+    talk = Conversation(autopilot, key=KEY, system=1)
+    for system, component in [
+        *((k, 1) for k in range(2, 40)),
+        *((1, k) for k in range(2, 40)),
+    ]:
+        other = mavlink.MAVLink(None, system, component)
+        other.signing.secret_key, other.signing.sign_outgoing = KEY, True
+        other.signing.timestamp = now_in_steps(UTC + 1000)
+        talk.inject(bytes(other.heartbeat_encode(2, 12, 0, 0, 4).pack(other)))
+    check_flight(talk.run(6.0))
+
+
+def test_links_that_are_silent_for_long_make_room() -> None:
+    """Autopilot and router change their link ids; what is dropped is too old to be taken again."""
+    now = now_in_steps(UTC + 1000)
+    full = SigningTimes(
+        now, tuple(((link, 1, 1), now - 7_000_000) for link in range(16))
+    )
+    autopilot = Autopilot("px4", key=KEY, utc=UTC + 1000)
+    autopilot.mav.signing.link_id = 99
+    check_flight(Conversation(autopilot, key=KEY, times=full).run(6.0))
+    busy = SigningTimes(now, tuple(((link, 1, 1), now - 1000) for link in range(16)))
+    refused = Conversation(
+        Autopilot("px4", key=KEY, utc=UTC + 1000), key=KEY, times=busy
+    )
+    refused.autopilots[0].mav.signing.link_id = 99
+    assert not refused.run(3.0).samples
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[]",
+        "{}",
+        '{"key": "KEY", "newest": Infinity, "latest": []}',
+        '{"key": "KEY", "newest": 281474976710656, "latest": []}',
+        '{"key": "KEY", "newest": 1, "latest": [[1, 1, 1, -1]]}',
+        '{"key": "KEY", "newest": 1, "latest": [[1, 1]]}',
+        '{"key": "0", "newest": 1, "latest": []}',
+    ],
+)
+def test_a_file_without_times_of_this_key_is_named_and_begun_anew(
+    tmp_path: Path, text: str
+) -> None:
+    path = tmp_path / "signing.json"
+    SigningFile(path, KEY).close()
+    mark = json.loads(path.read_text())["key"]
+    assert mark not in KEY.hex()
+    path.write_text(text.replace("KEY", mark))
+    file = SigningFile(path, KEY)
+    assert file.written == SigningTimes()
+    assert (
+        file.trouble
+        == f"signing times {path} holds no times of messages signed with this key: begun anew"
+    )
+    times = SigningTimes(5, (((0, 1, 1), 4),))
+    for second in range(3):
+        file.keep(times, (1 + second) * NS)
+    file.close()
+    assert SigningFile(path, KEY).written == times
+
+
+def test_times_are_written_every_five_seconds(tmp_path: Path) -> None:
+    path = tmp_path / "signing.json"
+    file = SigningFile(path, KEY)
+    written = set()
+    for step in range(1, 121):
+        file.keep(SigningTimes(step), NS + step * NS // 10)
+        file._wait()
+        written.add(file.written.newest)
+    assert sorted(written) == [0, 51, 101]
+    file.close()
+    assert SigningFile(path, KEY).written.newest == 120
+
+
+def test_a_message_of_another_system_hides_no_answer_of_the_autopilot() -> None:
+    """What nobody here can decode counts as seen only if the autopilot sent it."""
+    autopilot = Autopilot("ardupilot")
+    talk = Conversation(autopilot).run(3.0)
+    talk.cut = True
+    talk.run(0.1)
+    number = (talk.vehicle._sequence + 1) & 255
+    unknown = struct.pack("<BBBBBBBHB", 0xFD, 4, 0, 0, number, 9, 1, 0x1234, 0x56)
+    talk.inject(unknown + bytes(6))
+    talk.vehicle.parameters.clear()
+    autopilot.mav.seq = number
+    answer = autopilot.mav.param_value_encode(b"INS_USE", 1.0, 9, 1, 0)
+    talk.inject(bytes(answer.pack(autopilot.mav)))
+    assert [*talk.vehicle.parameters] == [("INS_USE", 1.0)]
 
 
 def test_what_has_no_checksum_that_can_be_known_is_no_sign_of_life() -> None:

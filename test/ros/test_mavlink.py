@@ -152,7 +152,12 @@ def test_a_faulty_imu_of_ardupilot_is_taken_out_of_use_and_put_back(
 def test_what_is_out_of_use_is_put_back_on_the_ground_if_the_monitor_reports_no_fault(
     quiet_domain, compiled, tmp_path
 ) -> None:
-    autopilot, file = Autopilot("ardupilot", armed=True), tmp_path / "out.json"
+    """The link is signed: the times of its messages go on over each restart."""
+    key, file = tmp_path / "key", tmp_path / "out.json"
+    key.touch(0o600)
+    key.write_bytes(bytes(range(32)))
+    autopilot = Autopilot("ardupilot", armed=True, key=key.read_bytes())
+    begun = autopilot.mav.signing.timestamp
     autopilot.parameters["INS_USE2"] = 0.0
     clocks = read_clocks()
     saved = {
@@ -163,9 +168,17 @@ def test_what_is_out_of_use_is_put_back_on_the_ground_if_the_monitor_reports_no_
         "computer_boot": clocks.boot,
     }
     file.write_text(json.dumps(saved))
-    failover = {"failover": "ardupilot", "failover_file": file}
+    failover = {
+        "failover": "ardupilot",
+        "failover_file": file,
+        "signing_key": key,
+    }
     with linked_over_udp(autopilot, **failover) as (ears, _):
         assert ears.says("failover", "out of use: IMU 2 of system 1")
+    times = json.loads((tmp_path / "mavlink_node_signing.json").read_text())
+    [[*sender, time_of_last]] = times["latest"]
+    assert sender == [0, 1, 1]
+    assert begun < time_of_last < autopilot.mav.signing.timestamp
     assert autopilot.parameters["INS_USE2"] == 0.0, "in flight it stays out"
     autopilot.armed = False
     with linked_over_udp(autopilot, **failover) as (ears, _):
