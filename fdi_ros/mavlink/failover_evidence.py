@@ -259,6 +259,8 @@ class Evidence:
         # Each pair of IMUs, in either order, and when it was last known, ns.
         self._pairs: dict[tuple[int, int], Compared] = {}
         self._known_at: dict[tuple[int, int], int] = {}
+        # The smallest steady difference of each at the last look, rad/s.
+        self._steady: dict[tuple[int, int], Vector] = {}
         self._tracks = [Track() for _ in range(count)]
         self._taken: set[int] = set()  # IMUs taken out in this flight
         self._once_bad: set[int] = set()  # those of them without a vote
@@ -399,15 +401,18 @@ class Evidence:
 
     def _compare(self, units: Sequence[int], now: int) -> None:
         """Compare each pair of IMUs."""
-        rates = {k: self.raw.rate(k) for k in units}
-        gains = {k: self.raw.gain(k) for k in units}
+        motions = {k: self.raw.motion(k) for k in units}
         for j, k in combinations(units, 2):
             difference = self.raw.between(j, k, now)
+            x, y, z = quick = self.raw.steady(j, k, now)
+            self._steady[j, k] = quick
+            self._steady[k, j] = -x, -y, -z
             if difference is not None:
                 self._known_at[j, k] = now
-                quick = self.raw.steady(j, k, now)
-                scale = SCALE * min(rates[j], rates[k])
-                found = _compared(difference, quick, scale, shift(gains[j], gains[k]))
+                one, other = motions[j], motions[k]
+                scale = SCALE * min(one.largest, other.largest)
+                shifts = shift(one.gain, other.gain)
+                found = _compared(difference, quick, scale, shifts)
             elif now - self._known_at.get((j, k), 0) > BREAK:
                 found = UNCOMPARED
             else:
@@ -435,7 +440,9 @@ class Evidence:
                 track.doubted = doubts
                 track.doubted_at = now
             own = [max(self._pairs[k, j].apart) for j in units if j != k]
-            is_turning = not track.wrong and math.hypot(*self.raw.turn(k)) >= TURN_RATE
+            is_turning = (
+                not track.wrong and math.hypot(*self.raw.motion(k).mean) >= TURN_RATE
+            )
             if track.turned is not None or (self._together and is_turning):
                 track.has_shown = True
             if self._together is not None and now - self._together >= TRUSTED:
@@ -526,10 +533,11 @@ class Evidence:
         A bias was apart at rest too. A gyro that has lost its scale on one axis shows that
         only in turns about this axis, and after any error a gyro may be dead.
         """
-        turn = self.raw.turn(other)
+        motion = self.raw.motion(other)
+        turn = motion.mean
         dead = SHOWN * self._min_size
         # What scatters does not agree from `CALM` on: twice that is shown by a shake.
-        shakes = [dead * shake / (2.0 * CALM) for shake in self.raw.shake(other)]
+        shakes = [dead * shake / (2.0 * CALM) for shake in motion.std]
         for axis in range(3):
             wrong = track.wrong.get(axis, WITHOUT_SCALE)
             needed = max(dead, min(SAME_TURN * wrong.rate, dead / wrong.share))
@@ -716,12 +724,12 @@ class Evidence:
         """
         others = [k for k in units if k != unit]
         least = LARGE_DIFFERENCE if self._tracks[unit].doubts else CLEAR_DIFFERENCE
-        rows = zip(*(self.raw.steady(unit, k, now) for k in others), strict=True)
+        rows = zip(*(self._steady[unit, k] for k in others), strict=True)
         sizes = [abs(nearest_zero(row)) for row in rows]
         axes = {axis for axis, size in enumerate(sizes) if size >= least}
         if not axes:
             return axes
-        limit = least + SCALE * max(map(self.raw.rate, others))
+        limit = least + SCALE * max(self.raw.motion(k).largest for k in others)
         return self._beyond_steps(axes, sizes, limit, others)
 
     def _beyond_steps(

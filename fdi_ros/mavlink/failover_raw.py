@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, starmap
 from typing import NamedTuple
 
 import numpy as np
@@ -71,6 +71,15 @@ class Difference(NamedTuple):
         return max(map(abs, self.mean))
 
 
+class Motion(NamedTuple):
+    """How an IMU has turned within `AVERAGED`, rad/s. NaN: no rates are known."""
+
+    largest: float  #: Largest rate.
+    gain: Vector  #: By how much the rate has grown, by axis.
+    mean: Vector  #: Mean rate: that of a turn.
+    std: Vector  #: Standard deviation of the rate: that of a shake.
+
+
 class Rows:
     """The last rates or differences with their times, oldest first, in arrays.
 
@@ -84,6 +93,7 @@ class Rows:
         self._kept = kept
         self._times = np.zeros(4 * kept, dtype=np.int64)
         self._values = np.zeros((4 * kept, 3))
+        self._arrays = [self._times, self._values]
         self._begin = self._end = 0
 
     def __len__(self) -> int:
@@ -92,8 +102,8 @@ class Rows:
     def append(self, time: int, values: Vector) -> None:
         """Add a row: time in ns, values in rad/s."""
         if self._end == len(self._times):
-            self._times[: len(self)] = self.times
-            self._values[: len(self)] = self.values
+            for array in self._arrays:
+                array[: len(self)] = array[self._begin :]
             self._begin, self._end = 0, len(self)
         self._times[self._end] = time
         self._values[self._end] = values
@@ -120,6 +130,56 @@ class Rows:
         return self._values[max(self._begin, self._end - count) : self._end]
 
 
+class Differences(Rows):
+    """The last differences of two IMUs, with the step and the time from each to the next.
+
+    Parameters
+    ----------
+    kept
+        Largest number of rows.
+    """
+
+    def __init__(self, kept: int) -> None:
+        super().__init__(kept)
+        self._pauses = np.zeros(len(self._times), dtype=np.int64)
+        self._squares = np.zeros_like(self._values)
+        self._arrays += [self._pauses, self._squares]
+        self._newest: tuple[int, Vector] = (-NS, UNKNOWN_RATES)
+
+    def append(self, time: int, values: Vector) -> None:
+        """Add a row: time in ns, values in rad/s."""
+        super().append(time, values)
+        before, (x, y, z) = self._newest
+        dx, dy, dz = values[0] - x, values[1] - y, values[2] - z
+        self._pauses[self._end - 1] = time - before
+        self._squares[self._end - 1] = dx * dx, dy * dy, dz * dz
+        self._newest = time, values
+
+    @property
+    def newest(self) -> tuple[int, Vector]:
+        """Time, ns, and values of the last row, rad/s, also if it was dropped."""
+        return self._newest
+
+    @property
+    def pauses(self) -> np.ndarray:
+        """Times between the rows, ns."""
+        return self._pauses[self._begin + 1 : self._end]
+
+    def younger(self, age: int) -> int:
+        """Return the number of rows that are younger than the last one by less than age, ns."""
+        return int(np.count_nonzero(self.times > self._newest[0] - age))
+
+    def roughness(self, count: int) -> list[float]:
+        """Return the standard deviation of white noise that steps as the last count rows do.
+
+        By axis, rad/s. NaN: there is no step.
+        """
+        first = max(self._begin, self._end - count) + 1
+        steps = self._end - first or math.nan
+        squares = np.add.reduce(self._squares[first : self._end]).tolist()
+        return [math.sqrt(square / steps / 2.0) for square in squares]
+
+
 class RawComparison:
     """Differences between the raw rates of count IMUs.
 
@@ -142,7 +202,9 @@ class RawComparison:
         self.fewest = max(FEWEST, QUICK // interval + 1)
         self._last: list[tuple[int, Vector]] = [(-NS, UNKNOWN_RATES)] * count
         self._recent = [Rows(KEPT) for _ in range(count)]
-        self._pairs = {(j, k): Rows(PAIRS_KEPT) for k in range(count) for j in range(k)}
+        self._motions: list[Motion | None] = [None] * count
+        units = range(count)
+        self._pairs = {pair: Differences(PAIRS_KEPT) for pair in combinations(units, 2)}
         # Whether the differences of each pair are a wave, and of which first and last this
         # was judged.
         self._judged = dict.fromkeys(self._pairs, (0, 0))
@@ -173,6 +235,7 @@ class RawComparison:
             self._beside[unit] = [last for _, last in self._last]
         self._last[unit] = stamp, rate
         self._recent[unit].append(stamp, rate)
+        self._motions[unit] = None
         for other, same in enumerate(self._same):
             if other != unit and same >= self._repeating and not self._stuck[other]:
                 self._stuck[other] = self._is_left_behind(other)
@@ -181,8 +244,8 @@ class RawComparison:
                 continue
             (first_stamp, first), (second_stamp, second) = (self._last[k] for k in pair)
             if abs(first_stamp - second_stamp) < self._reach:
-                x, y, z = (a - b for a, b in zip(first, second, strict=True))
-                rows.append(stamp, (x, y, z))
+                x, y, z = first
+                rows.append(stamp, (x - second[0], y - second[1], z - second[2]))
             rows.drop(stamp - WINDOWS * AVERAGED)
 
     def _is_left_behind(self, unit: int) -> bool:
@@ -228,27 +291,19 @@ class RawComparison:
         rates = self._recent[unit].last(periods * self._averaged)
         return rates if len(rates) else np.array([UNKNOWN_RATES])
 
-    def rate(self, unit: int) -> float:
-        """Return the largest rate of an IMU within `AVERAGED`, rad/s."""
-        return max(math.hypot(*rate) for rate in self._rates(unit).tolist())
-
-    def gain(self, unit: int) -> Vector:
-        """Return by how much the rate of an IMU has grown within `AVERAGED`, by axis, rad/s."""
-        rates = self._rates(unit)
-        x, y, z = (rates[-1] - rates[0]).tolist()
-        return x, y, z
-
-    def turn(self, unit: int) -> Vector:
-        """Return the mean rate of an IMU within `AVERAGED`, rad/s: that of a turn."""
-        x, y, z = _mean(self._rates(unit)).tolist()
-        return x, y, z
-
-    def shake(self, unit: int) -> Vector:
-        """Return the standard deviation of the rate of an IMU within `AVERAGED`, rad/s."""
-        rates = self._rates(unit)
-        deviation = rates - _mean(rates)
-        x, y, z = np.sqrt(_mean(deviation * deviation)).tolist()
-        return x, y, z
+    def motion(self, unit: int) -> Motion:
+        """Return how an IMU has turned within `AVERAGED`."""
+        motion = self._motions[unit]
+        if motion is None:
+            rates = self._rates(unit)
+            mean = _mean(rates)
+            deviation = rates - mean
+            std = np.sqrt(_mean(deviation * deviation))
+            vectors = (rates[-1] - rates[0], mean, std)
+            gain, turn, shake = (tuple(vector.tolist()) for vector in vectors)
+            largest = max(starmap(math.hypot, rates.tolist()))
+            motion = self._motions[unit] = Motion(largest, gain, turn, shake)
+        return motion
 
     def peaks(self, unit: int) -> Vector:
         """Return the largest rate of an IMU within twice `AVERAGED`, by axis, rad/s."""
@@ -261,8 +316,7 @@ class RawComparison:
 
     def repeats(self, unit: int, count: int) -> bool:
         """Return whether the last count samples of an IMU are all the same."""
-        rates = self._recent[unit].last(count)
-        return bool((rates == rates[:1]).all())
+        return self._same[unit] >= min(count, len(self._recent[unit]))
 
     def steps(self, unit: int, count: int) -> Vector:
         """Return how far each axis of an IMU changed within `SKEW`, rad/s.
@@ -285,16 +339,30 @@ class RawComparison:
         rows = self._rows(unit, other, now)
         if rows is None or len(rows) < self.fewest:
             return UNKNOWN_RATES
-        if max(map(abs, rows.values[-1].tolist())) < LARGE_DIFFERENCE:
+        if max(map(abs, rows.newest[1])) < LARGE_DIFFERENCE:
             return 0.0, 0.0, 0.0
+        late = rows.younger(TURNED)
+        count = min(self.fewest, late)
+        values = rows.last(count)
+        least = [nearest_zero(column) for column in values.T.tolist()]
+        if not any(least):
+            return 0.0, 0.0, 0.0
+        before = rows.last(late)
+        lowest = np.minimum.reduce(before).tolist()
+        highest = np.maximum.reduce(before).tolist()
+        means = _mean(values).tolist()
+        roughness = rows.roughness(count)
+        vibrates = self._vibrates(unit, other).tolist()
         sign = 1.0 if unit < other else -1.0
-        before = sign * rows.values[rows.times > rows.times[-1] - TURNED]
-        values = before[-self.fewest :]
-        least = np.array(list(map(nearest_zero, values.T.tolist())))
-        smooth = np.abs(_mean(values)) >= SMOOTHNESS * _roughness(values)
-        smooth &= ~self._vibrates(unit, other)
-        turned = (2.0 * before * np.sign(least) < -np.abs(least)).any(axis=0)
-        x, y, z = np.where(smooth & ~turned, least, 0.0).tolist()
+        found = [0.0, 0.0, 0.0]
+        for axis, size in enumerate(least):
+            has_turned = 2.0 * (lowest[axis] if size > 0.0 else -highest[axis]) < -abs(
+                size
+            )
+            is_smooth = abs(means[axis]) >= SMOOTHNESS * roughness[axis]
+            if is_smooth and not vibrates[axis] and not has_turned:
+                found[axis] = sign * size
+        x, y, z = found
         return x, y, z
 
     def between(
@@ -311,39 +379,46 @@ class RawComparison:
         rows = self._rows(unit, other, now)
         if rows is None:
             return None
-        times = rows.times
-        ages = times[-1] - times
-        count = last or max(self.fewest, int(np.count_nonzero(ages < AVERAGED)))
-        if len(rows) < max(2, count) or now - times[-count] > CURRENT:
+        late = rows.younger(AVERAGED)
+        count = last or max(self.fewest, late)
+        if len(rows) < max(2, count) or now - rows.times[-count] > CURRENT:
             return None
-        pauses = times[1:] - times[:-1]
-        if pauses.min() > self._longest:
+        pauses = rows.pauses
+        if np.minimum.reduce(pauses) > self._longest:
             return None
-        sign = 1.0 if unit < other else -1.0
-        values = sign * rows.values
-        late = values[-count:]
-        mean = _mean(late)
-        spread = _spread(late, mean)
-        std = spread / math.sqrt(count)
+        values = rows.last(count)
+        mean = _mean(values)
+        spread = _spread(values, mean)
         # A hole may hide half of an oscillation, so the time before it counts as well.
-        has_hole = pauses[1 - count :].max() > QUICK
-        span = 2 * AVERAGED if has_hole else AVERAGED
-        seen = values[-max(count, int(np.count_nonzero(ages < span))) :]
-        steady = np.abs(_mean(seen)) >= SMOOTHNESS * _roughness(seen)
-        if (~steady & (np.abs(mean) >= spread)).any():
-            steady |= _lasts(values, ages // AVERAGED)
-        if steady.any():
-            steady &= ~self._vibrates(unit, other)
-        x, y, z = (tuple(row.tolist()) for row in (mean, spread, std))
-        return Difference(x, y, z, tuple(steady.tolist()))
+        has_hole = np.maximum.reduce(pauses[1 - count :]) > QUICK
+        seen = max(count, rows.younger(2 * AVERAGED) if has_hole else late)
+        of_seen = mean if seen == count else _mean(rows.last(seen))
+        means, of_seen, spreads = mean.tolist(), of_seen.tolist(), spread.tolist()
+        roughness = rows.roughness(seen)
+        steady = [abs(of_seen[k]) >= SMOOTHNESS * roughness[k] for k in range(3)]
+        if any(not steady[k] and abs(means[k]) >= spreads[k] for k in range(3)):
+            lasts = _lasts(rows).tolist()
+            steady = [one or other for one, other in zip(steady, lasts, strict=True)]
+        if any(steady):
+            vibrates = self._vibrates(unit, other).tolist()
+            steady = [
+                one and not other for one, other in zip(steady, vibrates, strict=True)
+            ]
+        sign = 1.0 if unit < other else -1.0
+        x, y, z = means
+        root = math.sqrt(count)
+        std = spreads[0] / root, spreads[1] / root, spreads[2] / root
+        return Difference(
+            (sign * x, sign * y, sign * z), tuple(spreads), std, tuple(steady)
+        )
 
-    def _rows(self, unit: int, other: int, now: int) -> Rows | None:
+    def _rows(self, unit: int, other: int, now: int) -> Differences | None:
         """Return times and differences of late of two IMUs, or None if none is recent.
 
         Differences are those of the IMU with the smaller number less the other one.
         """
         rows = self._pairs[min(unit, other), max(unit, other)]
-        is_recent = len(rows) and now - rows.times[-1] <= CURRENT
+        is_recent = len(rows) and now - rows.newest[0] <= CURRENT
         return rows if is_recent else None
 
     def _vibrates(self, unit: int, other: int) -> np.ndarray:
@@ -357,15 +432,15 @@ class RawComparison:
         return self._waves[pair]
 
 
-def _is_wave(rows: Rows, longest: int) -> np.ndarray:
+def _is_wave(rows: Differences, longest: int) -> np.ndarray:
     """Return which columns an oscillation explains better than a line, beside holes.
 
     A hole is longer than longest, ns.
     """
+    if len(rows) < JUDGED or np.maximum.reduce(rows.pauses) <= longest:
+        return np.zeros(3, dtype=bool)
     times = rows.times
     values = rows.values
-    if len(rows) < JUDGED or np.diff(times).max() <= longest:
-        return np.zeros(3, dtype=bool)
     age = (times[-1] - times) / NS
     phase = 2.0 * np.pi * FREQUENCIES[:, None] * age
     line = _unexplained(np.ones((1, len(age))), age[None], values)
@@ -408,15 +483,10 @@ def _spread(values: np.ndarray, mean: np.ndarray) -> np.ndarray:
     return spread
 
 
-def _roughness(values: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of white noise that steps as much, by column."""
-    step = values[1:] - values[:-1]
-    rough: np.ndarray = np.sqrt(_mean(step * step) / 2.0)
-    return rough
-
-
-def _lasts(values: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """Return which columns have one sign in all windows, and means beyond their spread."""
+def _lasts(rows: Rows) -> np.ndarray:
+    """Return which axes have one sign in all windows, and means beyond their spread."""
+    values = rows.values
+    window = (rows.times[-1] - rows.times) // AVERAGED
     parts = [values[window == k] for k in range(WINDOWS)]
     if min(map(len, parts)) < FEWEST:
         return np.zeros(values.shape[1], dtype=bool)
