@@ -83,8 +83,10 @@ DOUBTS = {
     ChannelState.FAULTY,
     ChannelState.STALE,
 }
+STATES = {int(state): state for state in ChannelState}
 #: States of channels of which a fault would not be seen.
 UNJUDGED = {ChannelState.UNCHECKED, ChannelState.EXCLUDED, ChannelState.STALE}
+JUDGED = set(ChannelState) - UNJUDGED
 KNOWN_SIGMAS = 5.0  #: Standard deviations from which a size is known.
 SILENCE = NS // 2  #: An IMU without samples for this time does not deliver, ns.
 STATES_KNOWN_FOR = 5 * NS  #: Older states of the monitor are unknown, ns.
@@ -289,10 +291,10 @@ class Evidence:
         if now - self.heard >= SILENCE:
             self.begun = now
         self.heard = now
-        found = [ChannelState(int(state)) for state in states]
+        found = [STATES[int(state)] for state in states]
         for k, track in enumerate(self._tracks):
             track.states = tuple(found[3 * k : 3 * k + 3])
-            for axis in track.axes(*set(ChannelState) - UNJUDGED):
+            for axis in track.axes(*JUDGED):
                 track.judged_at[axis] = now
 
     def look(
