@@ -20,6 +20,7 @@ from fdi_ros.errors import FdiError
 from fdi_ros.mavlink.link import open_link
 from fdi_ros.mavlink.report import Reporter
 from fdi_ros.mavlink.signing import SigningFile, SigningTimes, now_in_steps, read_key
+from fdi_ros.mavlink.vehicle import parser_of
 from mavlink.autopilots import NS, UTC, Autopilot, Conversation
 
 MS = 1_000_000
@@ -500,6 +501,32 @@ def test_what_has_no_checksum_that_can_be_known_is_no_sign_of_life() -> None:
         talk.inject(unknown)
     assert talk.vehicle.counts["unknown"] == 50
     assert not talk.vehicle.in_reach
+
+
+def understood(parser: mavlink.MAVLink, data: bytes) -> list[tuple[int, bytes]]:
+    """Return numbers and bytes of the messages that a parser finds in bytes."""
+    parser.robust_parsing = True
+    found = parser.parse_buffer(data) or []
+    return [(one.get_msgId(), bytes(one.get_msgbuf())) for one in found]
+
+
+@pytest.mark.parametrize("is_old", [False, True])
+@pytest.mark.parametrize("key", [b"", KEY], ids=["unsigned", "signed"])
+def test_a_damaged_message_is_no_message_as_for_pymavlink(
+    key: bytes, is_old: bool
+) -> None:
+    sender = mavlink.MAVLink(None, 1, 1)
+    sender.signing.secret_key = key or None
+    sender.signing.sign_outgoing = bool(key)
+    message = sender.scaled_imu2_encode(70_000, 0, 0, -1000, 12, -30, 44, 0, 0, 0)
+    data = bytes(message.pack(sender, force_mavlink1=is_old))
+    heard = []
+    for at in range(len(data)):
+        for change in (0, 1, 0x80):
+            damaged = data[:at] + bytes((data[at] ^ change,)) + data[at + 1 :]
+            heard.append(understood(parser_of(mavlink)(None), damaged + data))
+            assert heard[-1] == understood(mavlink.MAVLink(None), damaged + data)
+    assert heard.count([(116, data), (116, data)]) >= len(data)
 
 
 @settings(max_examples=12)
