@@ -7,7 +7,8 @@ The monitor removes learned errors from the samples and remembers declarations. 
 comparison does neither and shows the present difference of the autopilot's own gyros.
 
 Two of three IMUs can be wrong alike: both stand still, or both are remembered as faulty. So
-they outvote the third only if they are trusted (`TRUSTED`), if their values change, and if
+they outvote the third on an axis only if they are trusted (`TRUSTED`) or have shown the same turn
+about it since they were found bad on another axis, if their values change, and if
 the monitor has no doubt about them that it does not have about the third as well. Two that
 were both taken out in this flight outvote one that was not only once both are back, and have
 agreed in turns about all axes.
@@ -16,7 +17,7 @@ agreed in turns about all axes.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import NamedTuple
@@ -108,6 +109,19 @@ class Compared(NamedTuple):
     full: Vector  #: The same, with what scales explain.
 
 
+class Partners(NamedTuple):
+    """IMUs with which one is compared."""
+
+    on: tuple[Set[int], ...] = (frozenset(),) * 3  #: By axis.
+    common: Set[int] = frozenset()  #: On all axes.
+    are_fit: bool = False  #: They are in use, trusted or proven.
+
+    def witness(self, axis: int) -> int | None:
+        """Return the only IMU that is a measure on an axis, or None."""
+        found = self.on[axis]
+        return min(found) if self.are_fit and len(found) == 1 else None
+
+
 class Wrong(NamedTuple):
     """How one axis of an IMU was bad."""
 
@@ -155,6 +169,14 @@ class Track:
     shown: set[int] = field(default_factory=set)
     #: Has agreed in a turn since the last time apart from all others.
     has_shown: bool = False
+    #: Axes about which it and another IMU have shown the same turn, since the monitor or the
+    #: raw rates last found a further axis bad.
+    proven: set[int] = field(default_factory=set)
+    bad: set[tuple[int, bool]] = field(default_factory=set)  #: Axes, and by whom.
+    unproven_at: int = 0  #: When the last one was found.
+    #: Axes that were apart from all others since it was last trusted. A gyro that has lost its
+    #: scale agrees with another bad one at some rate, so these are not proven.
+    off: set[int] = field(default_factory=set)
 
     @property
     def is_ok(self) -> bool:
@@ -176,9 +198,10 @@ class Track:
         return {axis for axis, state in enumerate(self.states) if state in wanted}
 
 
-def _nearest(found: Sequence[Vector]) -> Vector:
-    """Return the smallest of the differences of an IMU to its partners."""
-    return min(found, key=max, default=UNKNOWN_RATES)
+def _worst(sizes: Vector, blamed: set[int]) -> str:
+    """Return the axis that is off most, if it is blamed."""
+    axis = max(range(3), key=sizes.__getitem__)
+    return AXES[axis] if axis in blamed else ""
 
 
 def _note_sizes(track: Track, agreed: int | None, held: float, now: int) -> None:
@@ -329,30 +352,26 @@ class Evidence:
         self._compare(units, now)
         self._note_trust(units, now)
         odd, accused = self._lasting_odd_one(units, now)
-        partners: list[list[int]] = []
-        witnesses: list[int | None] = []
-        for k in range(len(delivers)):
-            found, witness = self._partners(k, units, out) if k in units else ([], None)
-            partners.append(found)
-            witnesses.append(witness)
+        partners = [self._partners(k, units, out) for k in range(len(delivers))]
         for k, track in enumerate(self._tracks):
-            pairs = [self._pairs[k, j] for j in partners[k]]
-            track.nearest = _nearest([pair.apart for pair in pairs])
-            track.bound = max(_nearest([pair.bound for pair in pairs]))
+            track.nearest = self._nearest(k, partners[k])
+            bounds = [max(self._pairs[k, j].bound) for j in partners[k].common]
+            track.bound = min(bounds, default=math.nan)
         elapsed = now - self._looked
         held = math.exp(-elapsed / NS / DECAY)
         self._looked = now
         imus = []
         for k, track in enumerate(self._tracks):
-            agreed = self._note_agreement(k, partners[k], k in out, now, elapsed)
+            common = partners[k].common
+            agreed = self._note_agreement(k, common, k in out, now, elapsed)
             _note_sizes(track, agreed, held, now)
             _note_apart(track, VOTE * self._min_size, now)
             _note_names(track, agreed, now)
             faulty = track.axes(ChannelState.FAULTY)
             axes = faulty | accused if k == odd else faulty
-            if track.outdated and not self._is_odd(k, units):
-                axes = axes - (track.outdated - self._axes_off_again(k, units, now))
-            blamed = self._is_blamed(track, axes, witnesses[k], now)
+            if track.outdated:
+                axes = axes - (track.outdated - self._odd_axes(k, units))
+            blamed = self._blamed_axes(track, axes, partners[k], now)
             if k in out or blamed:
                 self._note_wrong(track, partners[k], axes)
             elif agreed is not None and now - agreed >= HEALED:
@@ -360,7 +379,9 @@ class Evidence:
             is_known = track.states or k == odd
             found_now = Imu(
                 named=bool(faulty or k == odd) if is_known else None,
-                blamed=blamed,
+                blamed=bool(blamed),
+                worst=_worst(track.sizes, blamed),
+                fine=self._fine(k),
                 delivers=delivers[k],
                 least=self._least(k, units),
                 agreed=agreed,
@@ -368,6 +389,22 @@ class Evidence:
             imus.append(self._described(k, found_now, now))
         self.imus = tuple(imus)
         return self.imus
+
+    def _fine(self, unit: int) -> str:
+        """Return the axes that the monitor finds OK, such as xy.
+
+        Empty if there is another one, unless it is unchecked because all other IMUs are FAULTY
+        there: nothing is left that could show a fault of the last one.
+        """
+        faulty = [
+            track.axes(ChannelState.FAULTY)
+            for k, track in enumerate(self._tracks)
+            if k != unit
+        ]
+        track = self._tracks[unit]
+        alone = track.axes(ChannelState.UNCHECKED).intersection(*faulty)
+        fine = track.axes(ChannelState.OK)
+        return "".join(AXES[k] for k in sorted(fine)) if len(fine | alone) == 3 else ""
 
     def _described(self, unit: int, found: Imu, now: int) -> Imu:
         """Add to what was found of an IMU what is remembered of it."""
@@ -451,14 +488,48 @@ class Evidence:
                 is_old = now - track.doubted_at >= REFUTING
                 if track.has_shown:
                     track.refuted = doubts if is_old else track.refuted or set()
+                    track.off.clear()
             elif all(size >= self._min_size for size in own):
                 track.refuted = None
                 track.has_shown = False
+            self._note_proven(k, units, now)
+
+    def _note_proven(self, unit: int, units: Sequence[int], now: int) -> None:
+        """Note the axes on which an IMU and another one have shown the same turn.
+
+        An IMU that is found bad on a further axis may be dead: this counts anew on all.
+        """
+        track = self._tracks[unit]
+        pairs = {k: self._pairs[unit, k] for k in units if k != unit}
+        named = {(axis, True) for axis in track.axes(ChannelState.FAULTY)}
+        off = {
+            axis
+            for axis in range(3)
+            if not any(pair.apart[axis] < self._min_size for pair in pairs.values())
+        }
+        bad = named | {(axis, False) for axis in off}
+        if not bad <= track.bad:
+            track.proven.clear()
+            track.unproven_at = now
+        track.bad = bad
+        track.off |= off
+        if now - track.unproven_at < REFUTING:
+            # What is averaged may be from before.
+            return
+        turn = self.raw.motion(unit).mean
+        for k, pair in pairs.items():
+            other = self.raw.motion(k).mean
+            track.proven |= {
+                axis
+                for axis in {0, 1, 2} - track.off
+                if pair.bound[axis] < self._min_size
+                and min(abs(turn[axis]), abs(other[axis])) >= TURN_RATE
+            }
 
     def _note_agreement(
         self,
         unit: int,
-        partners: Sequence[int],
+        partners: Collection[int],
         is_out: bool,
         now: int,
         elapsed: int,
@@ -505,9 +576,7 @@ class Evidence:
         sizes = [max(self._pairs[pair].apart) for pair in pairs]
         return min((size for size in sizes if size >= 0.0), default=math.nan)
 
-    def _note_wrong(
-        self, track: Track, partners: Sequence[int], named: set[int]
-    ) -> None:
+    def _note_wrong(self, track: Track, partners: Partners, named: set[int]) -> None:
         """Note the axes on which a bad IMU is off or named, and its errors as shares.
 
         In a hover an axis that is named may be dead without being off. Of an IMU that is
@@ -518,7 +587,7 @@ class Evidence:
         }
         for axis in off:
             # Of a gyro without scale the error is this rate at most.
-            rate = max(self.raw.peaks(k)[axis] for k in partners)
+            rate = max(self.raw.peaks(k)[axis] for k in partners.on[axis])
             share = track.nearest[axis] / max(rate, TINY)
             before = track.wrong.get(axis, Wrong(rate, share))
             track.wrong[axis] = Wrong(max(rate, before.rate), max(share, before.share))
@@ -552,46 +621,66 @@ class Evidence:
 
     def _partners(
         self, unit: int, units: Sequence[int], out: Sequence[int]
-    ) -> tuple[list[int], int | None]:
+    ) -> Partners:
         """Return the IMUs with which one is compared: in use or trusted, or else all.
 
-        One that is stuck, or with an unknown difference, is no measure. For one that is
-        FAULTY, those are that the monitor does not doubt, if there are any: two that are FAULTY
-        may be so alike.
-
-        Also return the only IMU in use or trusted that is a measure, or None.
+        One that is out of use counts on its proven axes. One that is stuck, or with an unknown
+        difference, is no measure. For one that is FAULTY, those are that the monitor does not
+        doubt, if there are any: two that are FAULTY may be so alike.
         """
-        others = [k for k in units if k != unit and not self.raw.is_stuck(k)]
-        fit = [k for k in others if k not in out or self._is_trusted(k)]
-        apart = {k: max(self._pairs[unit, k].apart) for k in fit or others}
-        known = [k for k, size in apart.items() if not math.isnan(size)]
-        if not fit:
-            return known, None
+        if unit not in units:
+            return Partners()
         tracks = self._tracks
-        fine = [k for k in known if tracks[k].states and not tracks[k].doubts]
+        others = [k for k in units if k != unit and not self.raw.is_stuck(k)]
+        known = {k for k in others if not math.isnan(max(self._pairs[unit, k].apart))}
+        in_use = {k for k in others if k not in out or self._is_trusted(k)}
+        if not in_use:
+            return Partners((known,) * 3, known)
+        fine = {k for k in known if tracks[k].states and not tracks[k].doubts}
         is_faulty = ChannelState.FAULTY in tracks[unit].states
-        partners = (is_faulty and fine) or known
-        return partners, partners[0] if len(partners) == 1 else None
 
-    def _is_blamed(
-        self, track: Track, axes: set[int], witness: int | None, now: int
-    ) -> bool:
-        """Return whether an IMU, named on these axes, is apart on one of them.
+        def measures(fit: set[int]) -> set[int]:
+            return (is_faulty and fit & fine) or fit & known
+
+        common = measures(in_use)
+        if not common:
+            return Partners()
+        proven = [{k for k in others if axis in tracks[k].proven} for axis in range(3)]
+        on = tuple(measures(in_use | more) for more in proven)
+        return Partners(on, common, are_fit=True)
+
+    def _nearest(self, unit: int, partners: Partners) -> Vector:
+        """Return the smallest difference of an IMU to its partners, by axis, rad/s."""
+        x, y, z = (
+            min((self._pairs[unit, k].apart[axis] for k in found), default=math.nan)
+            for axis, found in enumerate(partners.on)
+        )
+        return x, y, z
+
+    def _blamed_axes(
+        self, track: Track, axes: set[int], partners: Partners, now: int
+    ) -> set[int]:
+        """Return the axes on which an IMU, named on these axes, is apart.
 
         Of two IMUs either may be wrong, or both by less than ``min_size``. So the monitor must
         not doubt that axis of the other one, and the difference must be `VOTE` times as large.
         Of a name that is older than the difference, the monitor may have yet to doubt the other
         one: the difference must stand for `DOUBT_TAKES`, or for `SET_STANDS` from
         `CLEAR_DIFFERENCE` on.
-
-        witness: the only IMU with which this one could be compared, or None.
         """
-        least = self._min_size
-        if witness is not None:
-            least *= VOTE
-            doubted = self._tracks[witness].axes(*DOUBTS)
-            axes = {k for k in axes - doubted if not self._is_early(track, k, now)}
-        return any(track.sizes[axis] >= least for axis in axes)
+        blamed = set()
+        for axis in axes:
+            witness = partners.witness(axis)
+            least = self._min_size
+            if witness is not None:
+                least *= VOTE
+                if axis in self._tracks[witness].axes(*DOUBTS):
+                    continue
+                if self._is_early(track, axis, now):
+                    continue
+            if track.sizes[axis] >= least:
+                blamed.add(axis)
+        return blamed
 
     def _is_early(self, track: Track, axis: int, now: int) -> bool:
         """Return whether an axis was named before it was apart, and the other may be doubted yet."""
@@ -615,7 +704,7 @@ class Evidence:
         sizes = pair.bound if doubted else pair.apart
         return is_sound and not is_stuck and max(sizes) < self._min_size
 
-    def _contradicted(self, unit: int, partners: Sequence[int]) -> set[int]:
+    def _contradicted(self, unit: int, partners: Collection[int]) -> set[int]:
         """Return the axes on which an IMU differs from a partner that the monitor does not name.
 
         Two IMUs that fail alike agree with each other, but not with the third.
@@ -637,46 +726,43 @@ class Evidence:
         may = unit in self._once_bad or not self._once_bad.issuperset(others)
         return others if len(others) == 2 and unit in units and may else []
 
-    def _is_odd(self, unit: int, units: Sequence[int]) -> bool:
-        """Return whether the two other IMUs agree, and nothing is against these two.
+    def _odd_axes(self, unit: int, units: Sequence[int]) -> set[int]:
+        """Return the axes on which the two other IMUs agree, and nothing is against these two.
 
-        Their values change. If this IMU is not stuck, they are trusted, and every doubt that
-        the monitor has of them was refuted before, or is one that it has of this IMU too.
-        """
-        others = self._voters(unit, units)
-        if not others:
-            return False
-        size = min(max(self._pairs[unit, k].apart) for k in others)
-        between = max(self._pairs[others[0], others[1]].mean)
-        if not between < max(self._min_size, ALIKE * size):
-            return False
-        if any(self.raw.repeats(k, self.raw.fewest) for k in others):
-            return False
-        if self.raw.is_stuck(unit):
-            return True
-        for k in others:
-            refuted = self._tracks[k].refuted
-            if refuted is None:
-                return False
-            if not self._tracks[k].doubts <= refuted | self._tracks[unit].doubts:
-                return False
-        return True
-
-    def _axes_off_again(self, unit: int, units: Sequence[int], now: int) -> set[int]:
-        """Return the axes on which an IMU is far off while two others agree on this axis.
-
-        One of these two may be bad on another axis: then no two IMUs agree on all axes.
+        Their values change. If this IMU is not stuck, they are trusted or proven there, and every
+        doubt that the monitor has of them was refuted before, or is one that it has of this IMU
+        too.
         """
         others = self._voters(unit, units)
         if not others:
             return set()
+        size = min(max(self._pairs[unit, k].apart) for k in others)
+        limit = max(self._min_size, ALIKE * size)
         between = self._pairs[others[0], others[1]].mean
-        doubted = {axis for k in others for axis in self._tracks[k].axes(*DOUBTS)}
-        return {
+        axes = {axis for axis, mean in enumerate(between) if mean < limit}
+        if any(self.raw.repeats(k, self.raw.fewest) for k in others):
+            return set()
+        if self.raw.is_stuck(unit):
+            return axes if len(axes) == 3 else set()
+        for k in others:
+            axes &= self._vouched_axes(k, self._tracks[unit])
+        return axes
+
+    def _vouched_axes(self, unit: int, accused: Track) -> set[int]:
+        """Return the axes on which an IMU may vote against another.
+
+        All, if it is trusted. Else the proven ones on which the monitor does not doubt it, or
+        doubts the other one alike. Names are older than the proof, and refuted by it.
+        """
+        track = self._tracks[unit]
+        if track.refuted is not None and track.doubts <= track.refuted | accused.doubts:
+            return {0, 1, 2}
+        doubted = {
             axis
-            for axis in self._clear_axes(unit, units, now) - doubted
-            if between[axis] < self._min_size
+            for axis in track.axes(*DOUBTS - {ChannelState.FAULTY})
+            if track.states[axis] is not accused.states[axis]
         }
+        return track.proven - doubted
 
     def _odd_one(self, units: Sequence[int], now: int) -> tuple[int, set[int], int]:
         """Return an IMU that is bad although the monitor does not name it.
@@ -689,10 +775,12 @@ class Evidence:
         only IMU with a set. If one of two others is not trusted, and this one is not stuck, a
         set proves nothing: two IMUs that fail alike put the healthy third one into a set.
         """
-        for k in units:
-            if not self._is_odd(k, units):
+        # One that is out is odd as before: another one may be so on another axis.
+        for k in sorted(units, key=self._taken.__contains__):
+            odd = self._odd_axes(k, units)
+            if not odd:
                 continue
-            if axes := self._clear_axes(k, units, now):
+            if axes := odd & self._clear_axes(k, units, now):
                 return k, axes, 0
             others = [j for j in units if j != k]
             sizes = [self._pairs[k, j].apart for j in others]
@@ -703,9 +791,9 @@ class Evidence:
                 (self._tracks[k].axes(ChannelState.AMBIGUOUS), vote, SET_STANDS),
             )
             for doubted, size, stands in checks:
-                if axes := {axis for axis in doubted if least[axis] >= size}:
+                if axes := {axis for axis in odd & {*doubted} if least[axis] >= size}:
                     return k, axes, stands
-            suspected = self._tracks[k].axes(ChannelState.SUSPECT)
+            suspected = odd & self._tracks[k].axes(ChannelState.SUSPECT)
             axes = {axis for axis in suspected if least[axis] >= vote}
             if axes := self._beyond_steps(axes, least, vote, others):
                 return k, axes, SUSPECT_STANDS

@@ -9,8 +9,11 @@ clock and no link. An order sets INS_USEk. `failover_words` has the texts for th
 `failover_ready` the conditions of "ready".
 
 Definitions
-    apart    raw rate differs by ``min_size`` or more, and more than scales explain, from
-             the nearest IMU that is in use or trusted. The errors of both may add up
+    apart    on an axis: raw rate differs by ``min_size`` or more, and more than scales explain,
+             from the nearest IMU that is in use, trusted, or proven on this axis. The errors of
+             both may add up
+    proven   on an axis: it and another IMU have shown the same turn about it since the monitor or
+             the raw rates last found it bad on a further axis. So it is not dead
     named    by the monitor, now or in its last report if that is not old, or by the raw
              rates: two of three IMUs agree, and the third is far off
     blamed   named on an axis that is apart. If only one other IMU can be compared: by twice
@@ -21,6 +24,8 @@ Definitions
     bad      blamed, and delivers. Else left in use.
     alive    delivers samples, and they change while other IMUs turn
     sound    alive, and the monitor finds all its axes OK, or it is not apart
+    reserve  for a bad IMU: sound. Or alive, OK on the axis on which the bad one is off most, and
+             unchecked on others only because all other IMUs are FAULTY there
     trusted  all IMUs have agreed for 2 s since it was last apart. A bad one in use prevents that
     ours     out of use by our order, or perhaps so: from the moment the order is sent
              until the autopilot reports "in use" `SETTLED` after it
@@ -44,8 +49,8 @@ Rules, in this order at each tick
        most ``limit`` IMUs are ours, without a limit all but one. Of two IMUs, one that has
        not agreed in a turn since it was bad is no reserve.
     3. Orders are sent until the autopilot reports the wanted state. An order to take an
-       IMU out is sent only while rule 2 holds, so also each repetition needs a sound
-       other IMU whose "in use" was reported within `FRESH`.
+       IMU out is sent only while rule 2 holds, so also each repetition needs a
+       reserve whose "in use" was reported within `FRESH`.
     4. If the autopilot reports no IMU in use, all of ours go back. A report within
        `STALE_ANSWER` of our order "back" may be older than that order, and does not count.
 
@@ -100,7 +105,11 @@ class Imu(NamedTuple):
     heard: int = LONG_AGO  #: Time of that report.
     named: bool | None = None  #: By the monitor or the raw rates. None: no reports.
     blamed: bool = False  #: Named on an axis that is apart, as defined above.
+    worst: str = ""  #: Axis that is off most, if blamed, such as x.
     ok: bool = False  #: The monitor finds all its channels OK.
+    #: Axes that the monitor finds OK, such as xy. Empty if it does not judge another one, unless
+    #: all other IMUs are FAULTY there.
+    fine: str = ""
     delivers: bool = False  #: Its samples arrive.
     stuck: bool = False  #: They repeat one value while another IMU moves.
     unjudged: str = (
@@ -108,7 +117,7 @@ class Imu(NamedTuple):
     )
     lane: bool = True  #: The autopilot has an EKF lane for it, as far as is known.
     size: float = float("nan")
-    """Largest raw difference to the nearest IMU of late, rad/s. NaN: unknown."""
+    """Largest raw difference of late to the IMU nearest on an axis, rad/s. NaN: unknown."""
     least: float = float("nan")
     """Present one to the nearest of all others, out of use or not, rad/s. NaN: unknown."""
     #: Not apart from a sound IMU since this time. None: apart, stuck or unknown. If the
@@ -220,6 +229,12 @@ def is_sound(imu: Imu, settings: PolicySettings) -> bool:
     return is_alive(imu) and (imu.ok or imu.size < settings.min_size)
 
 
+def is_reserve(imu: Imu, bad: Imu, settings: PolicySettings) -> bool:
+    """Return whether the autopilot flies better with an IMU than with a bad one."""
+    is_fine = is_alive(imu) and bool(bad.worst) and bad.worst in imu.fine
+    return is_fine or is_sound(imu, settings)
+
+
 def is_refused(memory: Memory) -> bool:
     """Return whether an IMU is reported in use after many orders to take it out."""
     return memory.held and memory.seen is True and memory.tries > QUICK_TRIES
@@ -249,7 +264,7 @@ def objection(
         view.imus[j].use
         and now - view.imus[j].heard <= FRESH
         and not memories[j].ours
-        and is_sound(view.imus[j], settings)
+        and is_reserve(view.imus[j], view.imus[k], settings)
         # Of two IMUs the monitor does not know which one is wrong. Both in use, the
         # autopilot flies as without failover.
         and (len(memories) > 2 or not view.imus[j].waits)

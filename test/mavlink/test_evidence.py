@@ -752,6 +752,73 @@ def test_a_set_that_flickers_names_its_imu() -> None:
     assert found == {2}
 
 
+# Votes by axis ----------------------------------------------------------------------------
+
+
+def with_one_out(rate: Callable[[float], np.ndarray], third: Gyro) -> Watched:
+    """IMU 1 has a harmless error on z that is named, IMU 3 is out of use and FAULTY on x."""
+    watched = watch()
+    watched.rate = rate
+    watched.gyros[0] = biased(0.02, axis=2)
+    watched.states[2] = FAULTY
+    watched.gyros[2] = third
+    watched.states[6] = FAULTY
+    watched.out = [2]
+    return watched.run(4.0)
+
+
+@pytest.mark.parametrize("state", [FAULTY, AMBIGUOUS])
+def test_an_imu_that_is_out_for_one_axis_is_a_witness_on_another(state: int) -> None:
+    watched = with_one_out(turning_about(2), biased(0.3, axis=0))
+    watched.gyros[1] = biased(0.15, axis=2)
+    watched.states[5] = state
+    watched.states[8] = AMBIGUOUS
+    assert watched.blamed(1.0) == {1, 2}
+    assert watched.step()[0].size < 0.03
+
+
+@pytest.mark.parametrize("third", [biased(0.3), zero])
+def test_an_imu_that_is_out_is_no_witness_before_a_turn(third: Gyro) -> None:
+    """It may be dead, as another one that dies later: the two agree at rest."""
+    watched = with_one_out(turning_about(0), third)
+    watched.gyros[0] = lambda rate: rate * np.array([1.0, 1.0, 0.0])
+    watched.states[5] = watched.states[8] = AMBIGUOUS
+    watched.rate = turning_about(2)
+    assert 1 not in watched.blamed(2.0)
+
+
+def test_two_that_are_bad_on_an_axis_have_no_vote_there_while_they_agree() -> None:
+    """One has lost half of its scale, the other one has a bias: alike at 0.3 rad/s."""
+    watched = watch()
+    watched.rate = turning_about(2)
+    watched.gyros[0] = lambda rate: rate * np.array([1.0, 1.0, 0.5])
+    watched.states[2] = FAULTY
+    watched.run(1.0).out = [0]
+    watched.gyros[1] = biased(-0.15, axis=2)
+    watched.states[5] = watched.states[8] = AMBIGUOUS
+    watched.run(3.0)
+    watched.rate = lambda t: np.array([0.0, 0.0, 0.3])
+    assert 2 not in watched.blamed(3.0)
+
+
+def test_the_last_gyro_of_an_axis_is_fine_on_the_others() -> None:
+    watched = watch()
+    watched.gyros[2] = biased(0.3, axis=2)
+    watched.states[8] = FAULTY
+    watched.out = [2]
+    watched.run(2.0)
+    watched.gyros[0] = zero
+    watched.states[:3] = [FAULTY] * 3
+    watched.states[5] = UNCHECKED
+    assert watched.blamed(1.0) == {0, 2}
+    watched.run(0.2)
+    imus = watched.step()
+    assert [imu.fine for imu in imus] == ["", "xy", ""]
+    assert imus[0].worst in ("x", "y")
+    watched.states[2] = OK
+    assert watched.step()[1].fine == ""
+
+
 # A name and its size ----------------------------------------------------------------------
 
 

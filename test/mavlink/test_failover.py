@@ -431,9 +431,28 @@ def test_a_clear_error_does_not_wait_for_the_monitor(flying: Monitored) -> None:
 
 
 def test_a_clear_error_while_the_others_differ_names_nobody(flying: Monitored) -> None:
+    flying.fault(1, (1.0, -2.0, 1.5), [OK] * 3)
+    flying.fault(2, (-0.3, 0.3, -0.3), [OK] * 3, seconds=3.0)
+    assert not flying.autopilots[0].sets
+
+
+def test_a_clear_error_on_an_axis_on_which_the_others_agree_is_out(
+    flying: Monitored,
+) -> None:
     flying.fault(1, (1.0, -2.0, 0.5), [OK] * 3)
     flying.fault(2, 0.3, [OK] * 3, seconds=3.0)
-    assert not flying.autopilots[0].sets
+    assert flying.in_use == [False, True, True]
+
+
+def test_of_the_last_two_on_an_axis_none_goes_out_and_the_pilot_is_told(
+    flying: Monitored,
+) -> None:
+    """IMU 3 has failed on z, and then IMU 1: nothing shows that it was not IMU 2."""
+    flying.fault(3, (0.0, 0.0, 0.3), (OK, OK, FAULTY), 4.0)
+    flying.states[5] = AMBIGUOUS
+    flying.fault(1, (0.0, 0.0, 0.2), (OK, OK, AMBIGUOUS), 7.0)
+    assert flying.in_use == [True, True, False]
+    assert flying.texts[-1] == "the IMUs disagree: land"
 
 
 def test_no_fault_is_not_said_of_an_imu_that_differs(flying: Monitored) -> None:

@@ -20,6 +20,7 @@ from fdi_ros.mavlink.failover_policy import (
     PolicyState,
     View,
     decide,
+    objection,
 )
 
 MS = 1_000_000
@@ -134,3 +135,22 @@ def test_of_two_imus_a_bad_one_stays_beside_one_that_waits_for_a_turn(
     state.memories[0].ours = False
     state = decide(state, view, at + 20 * MS, PolicySettings()).state
     assert state.memories[1].held == goes_out
+
+
+@pytest.mark.parametrize(
+    ("worst", "fine", "is_sound"),
+    [("x", "xy", True), ("z", "xy", False), ("", "xy", False), ("x", "", False)],
+)
+def test_a_reserve_that_is_not_ok_is_fine_where_the_bad_one_is_off_most(
+    worst, fine, is_sound
+):
+    """On z all others are FAULTY, so the monitor cannot check it."""
+    bad = Imu(
+        True, START, named=True, blamed=True, worst=worst, delivers=True, size=0.4
+    )
+    reserve = Imu(True, START, named=False, fine=fine, delivers=True, size=0.4)
+    out = bad._replace(use=False)
+    view = View((bad, reserve, out), linked=True, armed=True, monitored=True)
+    memories = (Memory(seen=True), Memory(seen=True), OUT)
+    words = objection(0, memories, view, START, PolicySettings())
+    assert words == ("" if is_sound else "no sound IMU reported in use")
