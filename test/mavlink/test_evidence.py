@@ -15,6 +15,7 @@ from fdi_ros.core.states import ChannelState
 from fdi_ros.mavlink.failover_evidence import STATES_KNOWN_FOR, Evidence
 from fdi_ros.mavlink.failover_policy import Imu
 from fdi_ros.mavlink.failover_raw import RawComparison, Rows
+from mavlink.watched_flights import WatchedFlight
 
 MS = 1_000_000
 NS = 1000 * MS
@@ -991,3 +992,10 @@ def test_an_imu_that_has_healed_is_trusted_again_while_the_vehicle_shakes() -> N
     watched.states = [AMBIGUOUS, OK, OK] * 3
     watched.gyros[2] = biased(-0.2)
     assert watched.blamed(1.0) == {2}
+
+
+@pytest.mark.parametrize("seed", [138, 1145])
+def test_a_random_flight_is_right_by_the_true_errors(seed: int) -> None:
+    """`python -m mavlink.watched_flights 200` flies more."""
+    done = WatchedFlight(seed).fly()
+    assert done["out of use"] >= 1
