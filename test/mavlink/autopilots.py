@@ -531,8 +531,9 @@ class Conversation:
                 self.vehicle.tick(self.now)
             self.now += STEP
             for peer, autopilot in zip(self.peers, self.autopilots, strict=True):
-                for data in autopilot.step(self.now):
-                    self._travel(None, data, peer)
+                if sent := autopilot.step(self.now):
+                    # A router joins messages of one time as well.
+                    self._travel(None, b"".join(sent), peer)
             while self._has_due(self.now):
                 _, _, number, peer, data = heapq.heappop(self._under_way)
                 if number < 0:
