@@ -123,6 +123,8 @@ class Columns(NamedTuple):
     accelerations: tuple[tuple[int, int, int], ...] = ()
     #: accelerations of each IMU are multiplied by this for m/s^2
     force_factors: tuple[float, ...] = ()
+    #: names of the IMUs in the table, empty if these hold the numbers
+    labels: tuple[str, ...] = ()
 
 
 class CsvLog(FlightLog):
@@ -141,8 +143,19 @@ class CsvLog(FlightLog):
     number: int | None = None
 
     def find_context(self) -> FlightContext:
-        """Return nothing: a table has rates and accelerations only."""
-        return FlightContext()
+        """Return the names of the IMUs in the table, where these are not numbers."""
+        _, columns = find_columns(self.file, lambda *_: None, self.number)
+        labels = dict(zip(columns.numbers, self._labels(columns), strict=False))
+        return FlightContext(
+            {
+                self._topic(source): labels[source.instance]
+                for source in self._sources
+                if source.instance in labels
+            }
+        )
+
+    def _labels(self, columns: Columns) -> tuple[str, ...]:
+        return columns.labels
 
     def _note_columns(self, line: str, names: str = "", why: str = "") -> None:
         """Note how columns were chosen, and those of a gyro that are left out."""
@@ -204,7 +217,10 @@ class CsvLog(FlightLog):
             if final:
                 break
         if bad:
-            self.note(f"{bad} lines without a time were left out")
+            lines_are = (
+                "line without a time was" if bad == 1 else "lines without a time were"
+            )
+            self.note(f"{bad} {lines_are} left out")
 
 
 class CsvUnit(CsvLog):
@@ -221,6 +237,11 @@ class CsvUnit(CsvLog):
                 f"{path} holds {len(self.topics)} IMUs, so it is a recording of its own:"
                 " name the file, or run fdi fleet on the folder"
             )
+
+    def _labels(self, columns: Columns) -> tuple[str, ...]:
+        numbers = [int(one) for one in re.findall(r"[0-9]{1,9}", self.path.stem)]
+        is_numbered = self.number in numbers
+        return () if is_numbered else (self.path.name,)
 
 
 def unit_numbers(paths: Sequence[Path]) -> list[int]:
@@ -303,7 +324,8 @@ def _columns(
     choice = _chosen_names(file, names, note)
     time_unit = str(choice.given.get("time_unit", _split(choice.time)[1]))
     first = number or 0
-    numbers = own_numbers([_of_imu(x) for x, _, _ in choice.imus])
+    heads = [_of_imu(x) for x, _, _ in choice.imus]
+    numbers = own_numbers(heads)
     if number is not None or max(numbers, default=MOST_IMUS) >= MOST_IMUS:
         numbers = list(range(first, first + len(choice.imus)))
     columns = Columns(
@@ -314,6 +336,7 @@ def _columns(
         tuple(choice.factors("rate_unit", choice.imus, _RATE_UNITS)),
         _places(names, choice.forces),
         tuple(choice.factors("acceleration_unit", choice.forces, _FORCE_UNITS)),
+        () if own_numbers(heads) == numbers else tuple(heads),
     )
     _note_choice(choice, columns, note)
     return columns
@@ -387,22 +410,22 @@ def _note_choice(choice: _Choice, columns: Columns, note: Note) -> None:
         note(f"accelerations in the order of the IMUs: {listed}{in_unit}")
 
 
-def has_gyros(file: BinaryIO) -> bool:
-    """Whether a table has columns of gyros."""
+def count_imus(file: BinaryIO) -> int:
+    """Return how many IMUs a table has columns of, 0 for none."""
     try:
-        find_columns(file, lambda *_: None)
+        _, columns = find_columns(file, lambda *_: None)
     except BagError:
-        return False
-    return True
+        return 0
+    return len(columns.imus)
 
 
-def is_table_of_gyros(path: Path) -> bool:
-    """Whether a file is a table with columns of gyros."""
+def imus_of_table(path: Path) -> int:
+    """Return how many IMUs a file has columns of, 0 if it is no table of gyros."""
     try:
         with open_regular(path) as file:
-            return has_gyros(file)
+            return count_imus(file)
     except OSError:
-        return False
+        return 0
 
 
 def _split(name: str) -> tuple[str, str]:

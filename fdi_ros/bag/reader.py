@@ -17,7 +17,7 @@ from pathlib import Path
 import zstandard
 
 from fdi_ros import __version__
-from fdi_ros.bag.csv_file import CsvLog, CsvUnit, is_table_of_gyros, unit_numbers
+from fdi_ros.bag.csv_file import CsvLog, CsvUnit, imus_of_table, unit_numbers
 from fdi_ros.bag.dataflash import DataflashLog
 from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.mcap_file import McapFile
@@ -146,7 +146,7 @@ class Recording:
                 before = merged.get(topic.name)
                 count = topic.count + (before.count if before else 0)
                 merged[topic.name] = replace(before or topic, count=count)
-        return tuple(merged[name] for name in sorted(merged))
+        return tuple(merged[name] for name in sorted(merged, key=natural_order))
 
     @property
     def texts(self) -> tuple[LogText, ...]:
@@ -156,8 +156,14 @@ class Recording:
     @property
     def context(self) -> FlightContext:
         """Temperatures, throttle and flight modes of a flight log."""
-        found = (file.context for file in self._files if file.context.origins)
-        return next(found, FlightContext())
+        found = [file.context for file in self._files if file.context.origins]
+        if not found:
+            return FlightContext()
+        # Of a folder of tables each names one IMU.
+        origins = {
+            name: one for context in found for name, one in context.origins.items()
+        }
+        return replace(found[0], origins=origins)
 
     @property
     def hardware_id(self) -> str:
@@ -252,7 +258,7 @@ class Recording:
         `BagError` if none can be opened.
         """
         if self.path.is_dir() and paths == tables_of(self.path):
-            tables = [path for path in paths if is_table_of_gyros(path)]
+            tables = [path for path in paths if imus_of_table(path)]
             for path in sorted(set(paths) - set(tables)) if tables else ():
                 self.damage.add(f"{path.name}: no columns of gyros, left out")
             tables = tables or list(paths)

@@ -244,13 +244,33 @@ def test_tables_of_a_folder_keep_their_numbers_and_are_merged_by_time(tmp_path):
         write_csv(tmp_path / f"imu{number}.csv", time + 0.001 * k, [rates[k]])
     with Recording(tmp_path) as recording:
         names = [topic.name for topic in recording.topics]
-        assert names == ["/imu_11", "/imu_2", "/imu_7"]
+        assert names == ["/imu_2", "/imu_7", "/imu_11"]
+        assert not recording.context.origins
         horizon = 0
         for batch in recording.batches(names):
             # No message comes later than the one before promised.
             assert batch.log_time.min() >= horizon
             horizon = batch.horizon
             assert horizon > batch.log_time.max() - 30 * 10**9
+
+
+def test_names_without_numbers_are_said_below_the_verdict(tmp_path, fdi):
+    """Files and columns have the names that people give their IMUs, topics have numbers."""
+    time, rates = drive()
+    folder = tmp_path / "boards"
+    folder.mkdir()
+    for name, unit in zip(("bmi088", "icm", "lsm6dso"), rates, strict=True):
+        write_csv(folder / f"{name}.csv", time, [unit])
+    table = write_csv(tmp_path / "table.csv", time, rates)
+    text = table.read_text()
+    for k, name in enumerate(("left", "right", "tail")):
+        text = text.replace(f"gyro{k}_", f"{name}_gyro_")
+    table.write_text(text)
+    said = "In the log, imu_0 is {}; imu_1 is {}; imu_2 is {}."
+    names = ("bmi088.csv", "icm.csv", "lsm6dso.csv")
+    assert said.format(*names) in fdi("replay", folder).out
+    columns = ("left_gyro", "right_gyro", "tail_gyro")
+    assert said.format(*columns) in fdi("replay", table).out
 
 
 def test_a_folder_of_whole_recordings_is_not_one_recording(tmp_path, refused):

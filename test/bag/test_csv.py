@@ -203,7 +203,7 @@ def test_an_imu_without_values_in_a_line_has_no_message_there(
     assert (found["/imu_2"][1] == RATES[1::2, 3:]).all()
     assert [line.partition(": ")[2] for line in damage[1:]] == [
         "the last line is not finished and was left out",
-        "1 lines without a time were left out",
+        "1 line without a time was left out",
     ]
     path.write_text("\n".join([*lines, *again]) + "\n")
     beside, damage = messages(path)
