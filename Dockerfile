@@ -4,7 +4,7 @@
 # The nodes in an image, run as a user who can change nothing of it:
 #   docker build -t fdi_ros .
 #   docker run --rm --net=host -v "$PWD/my_sensors.yaml:/config.yaml:ro" fdi_ros
-#   docker run --rm --net=host fdi_ros mavlink_node --ros-args --params-file config/px4.yaml -p url:=udpin:0.0.0.0:14540
+#   docker run --rm --net=host -v fdi:/home/fdi/.ros fdi_ros mavlink_node --ros-args --params-file config/px4.yaml -p url:=udpin:0.0.0.0:14540
 FROM ros:jazzy-ros-base
 
 WORKDIR /opt/fdi_ws
@@ -27,7 +27,8 @@ RUN . /opt/ros/jazzy/setup.sh && colcon build --packages-select fdi_ros \
     && chmod -R a+rX install \
     && ln -s install/fdi_ros/share/fdi_ros/config config
 
-RUN useradd --create-home fdi
+# The folder of files that outlive a restart is there for a volume, which takes over its owner.
+RUN useradd --create-home fdi && install --directory --owner=fdi --group=fdi /home/fdi/.ros
 USER fdi
 # Nodes of different users do not see each other over shared memory.
 ENV FASTDDS_BUILTIN_TRANSPORTS=UDPv4
