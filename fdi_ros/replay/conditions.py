@@ -240,8 +240,7 @@ def _on_quantity(part: str) -> Condition:
         expected = " or ".join(
             f"{name}{form}NUMBER" if form else name for form in _QUANTITIES[name]
         )
-        what = f"is compared by {sign!r}" if sign else "has no bound"
-        raise ConfigError(f"--check: {part!r} {what}, expected {expected}")
+        raise ConfigError(f"--check: expected {expected}, not {part!r}")
     if not sign:
         return Condition(part, name)
     try:

@@ -625,8 +625,9 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
             advice="check driver and bus, and record again",
         )
     elif tried.judged < LEAST_JUDGED:
-        note = tried.note or "channels are missing"
-        words = f"the monitor judges only {percent(tried.judged)} of the samples in the proof: {note}"
+        share = f"only {percent(tried.judged)}" if tried.judged else "none"
+        why = found.refused or tried.note or "channels are missing"
+        words = f"the monitor judges {share} of the samples in the proof: {why}"
         yield Finding(
             warning, "judged", words, (), tried.judged, None, LEAST_JUDGED, "DO NOT USE"
         )

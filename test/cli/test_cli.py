@@ -538,9 +538,10 @@ SIGN = f"{REPLAY} --fault 'channel=g1 kind=sign"
         ),
         (
             f"{REPLAY} --check 'delay>1'",
-            "'delay>1' is compared by '>', expected delay<NUMBER",
+            "expected delay<NUMBER or delay<=NUMBER, not 'delay>1'",
         ),
-        (f"{REPLAY} --check false", "'false' has no bound, expected false<NUMBER or"),
+        (f"{REPLAY} --check detected=1", "expected detected, not 'detected=1'"),
+        (f"{REPLAY} --check false", "--check: expected false<NUMBER or"),
         (
             f"{REPLAY} --check 'judged > x'",
             "'judged>x' has the bound 'x', expected a number",
