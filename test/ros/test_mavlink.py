@@ -174,6 +174,7 @@ def test_what_is_out_of_use_is_put_back_on_the_ground_if_the_monitor_reports_no_
         "signing_key": key,
     }
     with linked_over_udp(autopilot, **failover) as (ears, _):
+        assert ears.says("link", "ArduPilot, system 1")
         assert ears.says("failover", "out of use: IMU 2 of system 1")
     times = json.loads((tmp_path / "mavlink_node_signing.json").read_text())
     [[*sender, time_of_last]] = times["latest"]
