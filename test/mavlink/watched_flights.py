@@ -19,7 +19,7 @@ import numpy as np
 from fdi_ros.config.config import Config
 from fdi_ros.mavlink.failover_evidence import Evidence
 from fdi_ros.mavlink.failover_policy import PolicySettings, PolicyState, View, decide
-from fdi_ros.mavlink.failover_ready import Facts, not_again, not_ready
+from fdi_ros.mavlink.failover_ready import Facts, not_ready
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 
@@ -164,8 +164,7 @@ class WatchedFlight:
                 self.done["in use" if order.use else "out of use"] += 1
                 self.use[order.imu] = order.use
                 self.check_order(*order, i)
-        reason = not_again if any(memory.ours for memory in memories) else not_ready
-        self.check_answers(reason(memories, view, FACTS, now, SETTINGS), i)
+        self.check_answers(not_ready(memories, view, FACTS, now, SETTINGS), i)
 
     def check_order(self, imu: int, use: bool, i: int) -> None:
         """Check an order that was just obeyed, at sample i."""
