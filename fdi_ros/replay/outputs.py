@@ -8,12 +8,9 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
-from rosbags.interfaces import Connection
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 from fdi_ros import __version__
 from fdi_ros.bag.raw import MADE_BY_FDI, Batch
@@ -33,6 +30,9 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.recent import RecentHealth
 from fdi_ros.replay.run import Sink
 from fdi_ros.system.files import LATEST_TIME
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
 
 _STATE_NAMES = np.array([state.name for state in ChannelState])
 
@@ -105,7 +105,6 @@ def _text(value: float) -> str:
 
 NODE = "/fdi_node"
 """Default name of the node, which replaces ``~``."""
-_STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 class OutputBag(Sink):
@@ -119,6 +118,11 @@ class OutputBag(Sink):
     period = 1_000_000_000
 
     def __init__(self, path: Path, config: Config) -> None:
+        # The types of all releases of ROS 2, which most replays need not load.
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+
+        self._store = get_typestore(Stores.ROS2_JAZZY)
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         # This mark allows a later run to replace the bag. Other recordings are never replaced.
         self._writer.set_custom_data(MADE_BY_FDI, __version__)
@@ -228,7 +232,7 @@ class OutputBag(Sink):
             if name.startswith("~")
             else f"/{name.lstrip('/')}"
         )
-        return self._writer.add_connection(name, kind, typestore=_STORE)
+        return self._writer.add_connection(name, kind, typestore=self._store)
 
     def _diagnose(
         self, pipeline: Pipeline, now: int, inputs: Sequence[InputStatus]
