@@ -122,6 +122,9 @@ class Partners(NamedTuple):
         return min(found) if self.are_fit and len(found) == 1 else None
 
 
+NO_PARTNERS = Partners()
+
+
 class Wrong(NamedTuple):
     """How one axis of an IMU was bad."""
 
@@ -145,6 +148,7 @@ class Track:
     nearest: Vector = UNKNOWN_RATES  #: Difference to the nearest partner, rad/s.
     bound: float = math.nan  #: A bound on that, rad/s.
     sizes: Vector = UNKNOWN_RATES  #: Largest difference of late, by axis, rad/s.
+    partners: Partners = NO_PARTNERS  #: Against these.
     #: When each axis was last not FAULTY, and not apart enough for one witness.
     unnamed_at: list[int] = field(default_factory=lambda: [0] * 3)
     near_at: list[int] = field(default_factory=lambda: [0] * 3)
@@ -204,11 +208,13 @@ def _worst(sizes: Vector, blamed: set[int]) -> str:
     return AXES[axis] if axis in blamed else ""
 
 
-def _note_sizes(track: Track, agreed: int | None, held: float, now: int) -> None:
-    """Note the sizes of late. held: the share that is left of the last ones."""
-    x, y, z = track.nearest
+def _note_sizes(track: Track, agreed: int | None, held: Vector, now: int) -> None:
+    """Note the sizes of late. held: the share that is left of the last ones, by axis."""
     if agreed is None or now - agreed < HEALED:
-        x, y, z = map(max, track.nearest, [held * size for size in track.sizes])
+        before = (share * size for share, size in zip(held, track.sizes, strict=True))
+        x, y, z = map(max, track.nearest, before)
+    else:
+        x, y, z = track.nearest
     track.sizes = x, y, z
 
 
@@ -364,7 +370,9 @@ class Evidence:
         for k, track in enumerate(self._tracks):
             common = partners[k].common
             agreed = self._note_agreement(k, common, k in out, now, elapsed)
-            _note_sizes(track, agreed, held, now)
+            kept = self._kept(track, partners[k], held)
+            _note_sizes(track, agreed, kept, now)
+            track.partners = partners[k]
             _note_apart(track, VOTE * self._min_size, now)
             _note_names(track, agreed, now)
             faulty = track.axes(ChannelState.FAULTY)
@@ -629,7 +637,7 @@ class Evidence:
         doubt, if there are any: two that are FAULTY may be so alike.
         """
         if unit not in units:
-            return Partners()
+            return NO_PARTNERS
         tracks = self._tracks
         others = [k for k in units if k != unit and not self.raw.is_stuck(k)]
         known = {k for k in others if not math.isnan(max(self._pairs[unit, k].apart))}
@@ -644,7 +652,7 @@ class Evidence:
 
         common = measures(in_use)
         if not common:
-            return Partners()
+            return NO_PARTNERS
         proven = [{k for k in others if axis in tracks[k].proven} for axis in range(3)]
         on = tuple(measures(in_use | more) for more in proven)
         return Partners(on, common, are_fit=True)
@@ -681,6 +689,22 @@ class Evidence:
             if track.sizes[axis] >= least:
                 blamed.add(axis)
         return blamed
+
+    def _kept(self, track: Track, partners: Partners, share: float) -> Vector:
+        """Return which share is left of the last sizes, by axis: none if they may be others' errors.
+
+        They are those against the same partners, of which one alone was not in doubt.
+        """
+        kept = []
+        for axis in range(3):
+            witness = partners.witness(axis)
+            is_doubted = witness is not None and axis in self._tracks[witness].axes(
+                *DOUBTS
+            )
+            is_same = track.partners.on[axis] == partners.on[axis]
+            kept.append(share if is_same and not is_doubted else 0.0)
+        x, y, z = kept
+        return x, y, z
 
     def _is_early(self, track: Track, axis: int, now: int) -> bool:
         """Return whether an axis was named before it was apart, and the other may be doubted yet."""

@@ -348,8 +348,8 @@ class RawComparison:
         if not any(least):
             return 0.0, 0.0, 0.0
         before = rows.last(late)
-        lowest = np.minimum.reduce(before).tolist()
-        highest = np.maximum.reduce(before).tolist()
+        lowest = np.fmin.reduce(before).tolist()
+        highest = np.fmax.reduce(before).tolist()
         means = _mean(values).tolist()
         roughness = rows.roughness(count)
         vibrates = self._vibrates(unit, other).tolist()

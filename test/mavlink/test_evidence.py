@@ -999,3 +999,34 @@ def test_a_random_flight_is_right_by_the_true_errors(seed: int) -> None:
     """`python -m mavlink.watched_flights 200` flies more."""
     done = WatchedFlight(seed).fly()
     assert done["out of use"] >= 1
+
+
+def test_an_imu_is_not_blamed_for_the_error_of_another_that_has_healed() -> None:
+    """One is out, one is FAULTY and off by 0.008 rad/s, and the last is off for a second."""
+    watched = watch()
+    watched.rate = hovering
+    watched.gyros[1] = biased(0.3, axis=0)
+    watched.states[3] = FAULTY
+    watched.run(1.0).out = [1]
+    watched.gyros[0] = biased(0.008, axis=2)
+    watched.states[2] = FAULTY
+    watched.run(2.0)
+    watched.gyros[2] = biased(1.5, axis=2)
+    watched.states[8] = AMBIGUOUS
+    assert 0 not in watched.blamed(1.0)
+    watched.gyros[2] = sound
+    watched.run(0.2)
+    watched.states[8] = OK
+    assert 0 not in watched.blamed(2.0)
+
+
+def test_a_missing_rate_does_not_make_an_oscillation_steady() -> None:
+    """Differences of 0.5 rad/s that change their sign four times a second, and one NaN in 16."""
+    raw = RawComparison(2, STEP)
+    found = []
+    for k in range(1, 400):
+        size = 0.5 if k // 6 % 2 else -0.5
+        raw.feed(0, START + k * STEP, (0.0, 0.0, 0.0))
+        raw.feed(1, START + k * STEP, (math.nan if k % 16 == 0 else size, 0.0, 0.0))
+        found.append(raw.steady(0, 1, START + k * STEP)[0])
+    assert not any(abs(size) > 0.1 for size in found[50:])
