@@ -70,6 +70,14 @@ def read_key(path: str) -> bytes:
     return key
 
 
+def mark_of(key: bytes) -> str:
+    """Return a mark by which the files of keys are told apart.
+
+    It is as long as the digest in every message, so it reveals no more of the key.
+    """
+    return hmac.digest(key, b"signing times", "sha256")[:6].hex()
+
+
 class SigningTimes(NamedTuple):
     """Times of signed messages, in steps."""
 
@@ -157,8 +165,7 @@ class SigningFile(KeptFile[SigningTimes]):
     pause = 5 * NS
 
     def __init__(self, path: Path, key: bytes) -> None:
-        # As long as the digest in every message, so it reveals no more of the key.
-        self._mark = hmac.digest(key, b"signing times", "sha256")[:6].hex()
+        self._mark = mark_of(key)
         super().__init__(path, NO_TIMES)
 
     def decode(self, found: Any) -> SigningTimes:

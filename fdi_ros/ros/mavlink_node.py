@@ -42,7 +42,7 @@ from fdi_ros.mavlink.failover_ready import INS_USE
 from fdi_ros.mavlink.link import open_link
 from fdi_ros.mavlink.protocol import ImuSample, Thinning, system_ahead
 from fdi_ros.mavlink.report import Announcer, Reporter
-from fdi_ros.mavlink.signing import NO_TIMES, SigningFile, read_key
+from fdi_ros.mavlink.signing import NO_TIMES, SigningFile, mark_of, read_key
 from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import (
     DIAGNOSTICS,
@@ -169,7 +169,9 @@ class AutopilotNode(CheckedNode):
     ) -> SigningFile | None:
         if not key:
             return None
-        file = SigningFile(self._state_path(params, "signing"), key)
+        # A file for each key: a start with a wrong one must not end the times of the right one.
+        path = self._state_path(params, f"signing_{mark_of(key)}")
+        file = SigningFile(path, key)
         if file.trouble:
             self.get_logger().warning(file.trouble)
         return file

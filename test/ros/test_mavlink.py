@@ -176,7 +176,8 @@ def test_what_is_out_of_use_is_put_back_on_the_ground_if_the_monitor_reports_no_
     with linked_over_udp(autopilot, **failover) as (ears, _):
         assert ears.says("link", "ArduPilot, system 1")
         assert ears.says("failover", "out of use: IMU 2 of system 1")
-    times = json.loads((tmp_path / "mavlink_node_signing.json").read_text())
+    [kept] = tmp_path.glob("mavlink_node_signing_*.json")
+    times = json.loads(kept.read_text())
     [[*sender, time_of_last]] = times["latest"]
     assert sender == [0, 1, 1]
     assert begun < time_of_last < autopilot.mav.signing.timestamp
