@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_ros.bag.csv_file import count_imus, imus_of_table
+from fdi_ros.bag.csv_file import count_imus
 from fdi_ros.bag.raw import (
     LFS,
     LOG_SUFFIXES,
@@ -26,7 +26,6 @@ from fdi_ros.bag.raw import (
     Damage,
     files_of_bag,
     find_files,
-    tables_of,
 )
 from fdi_ros.bag.reader import FORMATS
 from fdi_ros.bag.samples import Samples, read_block
@@ -101,26 +100,14 @@ def _below(folder: Path, unread: list[str]) -> Iterator[Path]:
         walked.add(real)
         folders.sort()
         bag = files_of_bag(here)
-        units = _tables_of_units(here)
-        if bag is not None or units:
+        if bag is not None:
             yield here
         for path in (here / name for name in sorted(files)):
             # Other files in the folder of a bag belong to the bag, except logs.
-            if path in units:
-                continue
             if (
                 bag is None or path.name.lower().endswith(LOG_SUFFIXES)
             ) and _is_recording(path, unread):
                 yield path
-
-
-def _tables_of_units(folder: Path) -> list[Path]:
-    """Return the tables of a folder that are a recording together: each of one IMU."""
-    counts: dict[Path, int] = {}
-    with suppress(OSError):
-        counts = {path: imus_of_table(path) for path in tables_of(folder)}
-    units = [path for path, count in counts.items() if count == 1]
-    return units if len(units) > 1 and max(counts.values()) == 1 else []
 
 
 def _is_recording(path: Path, unread: list[str]) -> bool:

@@ -130,28 +130,13 @@ def test_recordings_are_found_each_once_by_whatever_name(fleet, tmp_path):
             find_recordings([str(tmp_path / name)])
 
 
-def test_a_folder_of_one_table_a_unit_is_one_recording(tmp_path):
-    """As `fdi replay` reads it. A table of several IMUs, or of one alone, is a recording of its own."""
-    names = (
-        "heron/a.csv",
-        "heron/b.csv",
-        "kite/both.csv",
-        "kite/one.csv",
-        "wren/c.csv",
-    )
-    for name in names:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        units = ("left", "right") if name == "kite/both.csv" else ("left",)
-        columns = [f"{unit}_gyro_{axis}" for unit in units for axis in "xyz"]
+def test_tables_of_one_imu_each_may_be_of_different_flights(tmp_path):
+    for name in ("flight_1.csv", "flight_2.csv"):
+        columns = [f"gyro_{axis}" for axis in "xyz"]
         (tmp_path / name).write_text(",".join(["time", *columns]) + "\n")
-    (tmp_path / "heron" / "places.csv").write_text("time,lat,lon,height\n")
+    (tmp_path / "places.csv").write_text("time,lat,lon,height\n")
     found, _ = find_recordings([str(tmp_path)])
-    assert [str(path.relative_to(tmp_path)) for path in found] == [
-        "heron",
-        "kite/both.csv",
-        "kite/one.csv",
-        "wren/c.csv",
-    ]
+    assert [path.name for path in found] == ["flight_1.csv", "flight_2.csv"]
 
 
 def test_recordings_behind_links_and_beside_other_metadata_are_found(
