@@ -14,6 +14,7 @@ the sample path bounds the largest term (`fdi_ros.core.level.fill_level`). NumPy
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from itertools import combinations
@@ -85,6 +86,12 @@ class Integrity:
         self._axes = geometry.axes
         self._noise = noise.noise_std**2
         norm = np.linalg.norm(geometry.axes, axis=1)
+        # All that a level depends on.
+        self._inputs = (
+            self.risk,
+            self.alarm_probability,
+            *(part.tobytes() for part in (self.prior, self._axes, self._noise)),
+        )
         scale = noise.scale_std * norm * settings.max_rate
         timing = noise.timing_std * norm * settings.max_acceleration
         greatest: Array = (
@@ -93,12 +100,18 @@ class Integrity:
         self.scale = math.sqrt(float((greatest / self._noise).max()))
         """By how much the errors of the channels exceed noise_std in the greatest motion."""
 
+    def __hash__(self) -> int:
+        return hash(self._inputs)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Integrity) and self._inputs == other._inputs
+
     def fill(self, subsets: NDArray[Any], *masks: int) -> None:
         """Write the levels for sets of channels, by their bits, into their records (2^n,), unless they are there."""
         n = len(self._axes)
         for mask in masks:
             if not subsets["has_level"][mask]:
-                known = self.of(flags_of(mask, n))
+                known = _level_of(self, mask)
                 subset = subsets[mask]
                 subset["level"] = known.level
                 subset["limit"][:n] = known.limit
@@ -158,6 +171,13 @@ class Integrity:
         if np.isfinite(level).all():
             share[kept] = _share(level, gain**2 * variance / sigma[:, None] ** 2, modes)
         return ProtectionLevel(level, limit, share)
+
+
+# 12 channels have 79 sets that are prepared, and accelerometers as many.
+@functools.lru_cache(maxsize=1024)
+def _level_of(integrity: Integrity, mask: int) -> ProtectionLevel:
+    """Level with the channels in mask, by their bits: the same in each replay of a sweep."""
+    return integrity.of(flags_of(mask, len(integrity.prior)))
 
 
 def _modes(
