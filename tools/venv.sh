@@ -43,7 +43,7 @@ install() {
     .venv/bin/python -m pip install -qq --no-compile --disable-pip-version-check "$@"
 }
 # What builds the package is fetched once, and not for each of two builds: 5 s of CPU less.
-install "setuptools>=64"
+install "setuptools>=64" wheel
 if [ "${3:-}" = compile ]; then
     install --no-build-isolation --editable .
     .venv/bin/python -m fdi_ros.cli compile --detector sequential &
