@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from fdi_ros.model.samples import Array
 from fdi_ros.report.layout import RADIANS, Section, Unit, colour_of, drawn
@@ -24,8 +23,6 @@ SAMPLES_AT_ONCE = 16 * PIECE
 """Samples that are transformed at once."""
 STANDS_OUT = 4.0
 """Smallest ratio of a line to its baseline."""
-BASELINE = 31
-"""Frequencies whose median is the baseline of a line."""
 
 
 class Spectrum:
@@ -98,17 +95,16 @@ class Spectrum:
 
     def _words(self, density: Array) -> str:
         """Name the lines and likely aliases. ``density``: without 0 Hz."""
+        # Imported late, because most users do not need SciPy.
+        from scipy.ndimage import median_filter
+        from scipy.signal import find_peaks
+
         half = self._rate / 2
         step = self._rate / PIECE
-        ends = (BASELINE // 2, BASELINE // 2)
-        padded = np.pad(density, (ends, (0, 0)), mode="edge")
-        around = np.median(sliding_window_view(padded, BASELINE, axis=0), axis=-1)
-        height = (density / around).max(axis=1)
-        middle = height[1:-1]
-        is_peak = (middle > height[:-2]) & (middle > height[2:])
-        peaks = np.flatnonzero(is_peak & (middle >= STANDS_OUT)) + 1
-        highest = peaks[np.argsort(-height[peaks])][:3]
-        found = [(peak + 1) * step for peak in highest.tolist()]
+        # The median of 31 frequencies is the baseline of a line.
+        around = median_filter(density, size=(31, 1), mode="nearest")
+        peaks, about = find_peaks((density / around).max(axis=1), height=STANDS_OUT)
+        found = [(peaks[k] + 1) * step for k in np.argsort(-about["peak_heights"])[:3]]
         words = []
         if found:
             lines = ", ".join(
@@ -125,24 +121,13 @@ class Spectrum:
         return " ".join(words)
 
     def _average(self, values: Array) -> None:
+        from scipy.signal import welch
+
         known = np.isfinite(values[0])
         if known.any():
             weight = len(values) * 2 // PIECE - 1
-            self._power[:, known] += weight * _welch(values[:, known], self._rate)
+            power = welch(
+                values[:, known], self._rate, nperseg=PIECE, axis=0, detrend="linear"
+            )[1]
+            self._power[:, known] += weight * power
             self._weight[known] += weight
-
-
-def _welch(values: Array, rate: float) -> Array:
-    """Return the power density (PIECE // 2 + 1, n) of samples (N, n), per Hz.
-
-    The mean over pieces that overlap by half, each less a straight line, with Hann's window.
-    """
-    pieces = sliding_window_view(values, PIECE, axis=0)[:: PIECE // 2]
-    time = np.arange(PIECE) - (PIECE - 1) / 2
-    slope = (pieces @ time)[..., None] / (time @ time)
-    apart = pieces - pieces.mean(axis=-1, keepdims=True) - slope * time
-    window = np.hanning(PIECE + 1)[:-1]
-    power = np.abs(np.fft.rfft(window * apart)) ** 2 / (rate * (window @ window))
-    # Both signs of a frequency.
-    power[..., 1:-1] *= 2.0
-    return np.asarray(power.mean(axis=0).T)
