@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from fdi_ros.config.settings import LEAST_NOISE
 from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
@@ -214,23 +215,18 @@ def without_spikes(values: Array) -> tuple[Array, Mask]:
     spikes = np.zeros(values.shape, dtype=bool)
     if len(values) <= 2 * SPIKE_REACH:
         return values, spikes
-    middle = values[SPIKE_REACH:-SPIKE_REACH]
-    begins = [k for k in range(2 * SPIKE_REACH + 1) if k != SPIKE_REACH]
-    around = np.stack([values[k : k + len(middle)] for k in begins])
-    low = around.min(axis=0)
-    high = around.max(axis=0)
+    around = np.delete(
+        sliding_window_view(values, 2 * SPIKE_REACH + 1, axis=0), SPIKE_REACH, axis=-1
+    )
+    median = np.median(around, axis=-1)
     change = np.abs(values[1:-1] - 0.5 * (values[2:] + values[:-2]))
     step = np.abs(np.diff(values, axis=0))
     # Coarse values at rest mostly repeat. Then one step of theirs is usual.
     least = np.where(step > 0.0, step, np.inf).min(axis=0)
     usual = np.maximum(np.median(change, axis=0), least)
-    bound = np.maximum(SPIKE_RATIO * usual, SPIKE_ISOLATION * (high - low))
-    # The median costs most, and no value is farther from it than from the farthest.
-    far = np.maximum(middle - low, high - middle) > bound
-    median = np.zeros_like(middle)
-    median[far] = np.median(around[:, far], axis=0)
+    bound = np.maximum(SPIKE_RATIO * usual, SPIKE_ISOLATION * np.ptp(around, axis=-1))
     inside = spikes[SPIKE_REACH:-SPIKE_REACH]
-    inside[:] = far & (np.abs(middle - median) > bound)
+    inside[:] = np.abs(values[SPIKE_REACH:-SPIKE_REACH] - median) > bound
     spikes &= spikes.mean(axis=0) < FREQUENT
     clean = values.copy()
     clean[SPIKE_REACH:-SPIKE_REACH][inside] = median[inside]
