@@ -15,6 +15,7 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Callable
+from typing import NoReturn, Protocol
 
 import numpy as np
 
@@ -277,18 +278,36 @@ class Flight:
         return self.done
 
 
-def violation(number: int, done: Counter[str]) -> str:
+class Flown(Protocol):
+    """A random flight that checks itself."""
+
+    done: Counter[str]  #: What was done so far.
+
+    def fly(self) -> object:
+        """Fly. Raise `AssertionError` if something is violated."""
+
+
+def violation(flight: Flown, number: int, done: Counter[str]) -> str:
     """Fly one flight, add what was done, and return what was violated; empty: nothing."""
     try:
-        done.update(Flight(number).fly())
+        flight.fly()
     except AssertionError as error:
         return f"flight {number}: {error}"
+    finally:
+        done.update(flight.done)
     return ""
 
 
-if __name__ == "__main__":
+def fly_all(begin: Callable[[int], Flown]) -> NoReturn:
+    """Fly the flights that the command line asks for, print what was done, and exit: 1 if anything is violated."""
     first, last = map(int, ["0", *sys.argv[1:]][-2:])
     total = Counter[str]()
-    found = [text for k in range(first, last) if (text := violation(k, total))]
+    found = [
+        text for k in range(first, last) if (text := violation(begin(k), k, total))
+    ]
     print(f"flights {first} to {last - 1}:", dict(total), *found, sep="\n")
     sys.exit(bool(found))
+
+
+if __name__ == "__main__":
+    fly_all(Flight)

@@ -10,7 +10,6 @@ moment without one, is checked against the true errors of the gyros. `mavlink.fl
 link, the autopilot and other stations.
 """
 
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -22,14 +21,14 @@ from fdi_ros.mavlink.failover_policy import PolicySettings, PolicyState, View, d
 from fdi_ros.mavlink.failover_ready import Facts, not_ready
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
+from mavlink.flights import fly_all
 
 CONFIG = Path(__file__).parents[2] / "config" / "ardupilot.yaml"
 MS = 1_000_000
 NS = 1000 * MS
 START = 1000 * NS
-INTERVAL = (
-    9 * MS
-)  #: Between two samples of each gyro, ns. The monitor gets every second one.
+#: Between two samples of each gyro, ns. The monitor gets every second one.
+INTERVAL = 9 * MS
 TURN = 4  #: Samples between two turns of failover.
 ARMED_AT = 12.0  #: s, after gentle motion.
 CALM_FOR = 10.0  #: Time without a new fault at the end of a flight, s.
@@ -210,21 +209,5 @@ class WatchedFlight:
         return self.done
 
 
-def violation(number: int, done: Counter[str]) -> str:
-    """Fly one flight, add what was done, and return what was violated; empty: nothing."""
-    flight = WatchedFlight(number)
-    try:
-        flight.fly()
-    except AssertionError as error:
-        return f"flight {number}: {error}"
-    finally:
-        done.update(flight.done)
-    return ""
-
-
 if __name__ == "__main__":
-    first, last = map(int, ["0", *sys.argv[1:]][-2:])
-    total = Counter[str]()
-    found = [text for k in range(first, last) if (text := violation(k, total))]
-    print(f"flights {first} to {last - 1}:", dict(total), *found, sep="\n")
-    sys.exit(bool(found))
+    fly_all(WatchedFlight)
