@@ -410,22 +410,22 @@ def _note_choice(choice: _Choice, columns: Columns, note: Note) -> None:
         note(f"accelerations in the order of the IMUs: {listed}{in_unit}")
 
 
-def count_imus(file: BinaryIO) -> int:
-    """Return how many IMUs a table has columns of, 0 for none."""
+def has_gyros(file: BinaryIO) -> bool:
+    """Whether a table has columns of gyros."""
     try:
-        _, columns = find_columns(file, lambda *_: None)
+        find_columns(file, lambda *_: None)
     except BagError:
-        return 0
-    return len(columns.imus)
+        return False
+    return True
 
 
-def imus_of_table(path: Path) -> int:
-    """Return how many IMUs a file has columns of, 0 if it is no table of gyros."""
+def is_table_of_gyros(path: Path) -> bool:
+    """Whether a file is a table with columns of gyros."""
     try:
         with open_regular(path) as file:
-            return count_imus(file)
+            return has_gyros(file)
     except OSError:
-        return 0
+        return False
 
 
 def _split(name: str) -> tuple[str, str]:

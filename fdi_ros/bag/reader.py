@@ -17,7 +17,7 @@ from pathlib import Path
 import zstandard
 
 from fdi_ros import __version__
-from fdi_ros.bag.csv_file import CsvLog, CsvUnit, imus_of_table, unit_numbers
+from fdi_ros.bag.csv_file import CsvLog, CsvUnit, is_table_of_gyros, unit_numbers
 from fdi_ros.bag.dataflash import DataflashLog
 from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.mcap_file import McapFile
@@ -258,7 +258,7 @@ class Recording:
         `BagError` if none can be opened.
         """
         if self.path.is_dir() and paths == tables_of(self.path):
-            tables = [path for path in paths if imus_of_table(path)]
+            tables = [path for path in paths if is_table_of_gyros(path)]
             for path in sorted(set(paths) - set(tables)) if tables else ():
                 self.damage.add(f"{path.name}: no columns of gyros, left out")
             tables = tables or list(paths)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_ros.bag.csv_file import count_imus
+from fdi_ros.bag.csv_file import has_gyros
 from fdi_ros.bag.raw import (
     LFS,
     LOG_SUFFIXES,
@@ -123,7 +123,7 @@ def _is_recording(path: Path, unread: list[str]) -> bool:
     try:
         with open_regular(path) as file:
             if suffix == ".csv":
-                return count_imus(file) > 0
+                return has_gyros(file)
             begin = file.read(len(LFS))
     except OSError:
         # Reading the file will report the error.
