@@ -154,18 +154,17 @@ class Verifier:
 
 
 class SigningFile(KeptFile[SigningTimes]):
-    """Keeps the times of messages signed with a key.
+    """Keeps the times of messages signed with one key.
 
     A card wears out by writing: after a power cut, messages of the last `pause` before it
     could be repeated.
     """
 
     name = "signing times"
-    unfit = "holds no times of messages signed with this key: begun anew"
+    unfit = "holds no times of signed messages: begun anew"
     pause = 5 * NS
 
-    def __init__(self, path: Path, key: bytes) -> None:
-        self._mark = mark_of(key)
+    def __init__(self, path: Path) -> None:
         super().__init__(path, NO_TIMES)
 
     def decode(self, found: Any) -> SigningTimes:
@@ -175,7 +174,7 @@ class SigningFile(KeptFile[SigningTimes]):
         )
         newest = int(found["newest"])
         times = [newest, *(time for _, time in latest)]
-        if found["key"] != self._mark or len(latest) > _SENDERS:
+        if len(latest) > _SENDERS:
             raise ValueError
         if not 0 <= min(times) <= max(times) <= _LARGEST_TIME:
             raise ValueError
@@ -184,4 +183,4 @@ class SigningFile(KeptFile[SigningTimes]):
     def encode(self, content: SigningTimes) -> dict[str, Any]:
         """Return what is written."""
         rows = [[*sender, time] for sender, time in content.latest]
-        return {"key": self._mark, "newest": content.newest, "latest": rows}
+        return {"newest": content.newest, "latest": rows}

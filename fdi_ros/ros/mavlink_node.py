@@ -170,8 +170,7 @@ class AutopilotNode(CheckedNode):
         if not key:
             return None
         # A file for each key: a start with a wrong one must not end the times of the right one.
-        path = self._state_path(params, f"signing_{mark_of(key)}")
-        file = SigningFile(path, key)
+        file = SigningFile(self._state_path(params, f"signing_{mark_of(key)}"))
         if file.trouble:
             self.get_logger().warning(file.trouble)
         return file

@@ -3,7 +3,6 @@
 
 """The conversation with simulated autopilots: what comes out, what is asked for, and what is refused."""
 
-import json
 import re
 import struct
 from collections.abc import Callable
@@ -19,7 +18,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fdi_ros.errors import FdiError
 from fdi_ros.mavlink.link import open_link
 from fdi_ros.mavlink.report import Reporter
-from fdi_ros.mavlink.signing import SigningFile, SigningTimes, now_in_steps, read_key
+from fdi_ros.mavlink.signing import (
+    SigningFile,
+    SigningTimes,
+    mark_of,
+    now_in_steps,
+    read_key,
+)
 from fdi_ros.mavlink.vehicle import parser_of
 from mavlink.autopilots import NS, UTC, Autopilot, Conversation
 
@@ -351,11 +356,11 @@ def test_what_was_signed_before_a_restart_is_refused_after_it(tmp_path: Path) ->
     whole = autopilot.step
     autopilot.step = lambda now: recorded.extend(sent := whole(now)) or sent
     before.run(6.0)
-    file = SigningFile(tmp_path / "signing.json", KEY)
+    file = SigningFile(tmp_path / "signing.json")
     file.keep(before.vehicle.signing_times, before.now)
     file.close()
 
-    times = SigningFile(tmp_path / "signing.json", KEY).written
+    times = SigningFile(tmp_path / "signing.json").written
     after = Conversation(key=KEY, times=times)
     after.now = before.now + 40 * NS
     for data in recorded:
@@ -435,37 +440,39 @@ def test_links_that_are_silent_for_long_make_room() -> None:
     [
         "[]",
         "{}",
-        '{"key": "KEY", "newest": Infinity, "latest": []}',
-        '{"key": "KEY", "newest": 281474976710656, "latest": []}',
-        '{"key": "KEY", "newest": 1, "latest": [[1, 1, 1, -1]]}',
-        '{"key": "KEY", "newest": 1, "latest": [[1, 1]]}',
-        '{"key": "0", "newest": 1, "latest": []}',
+        '{"newest": Infinity, "latest": []}',
+        '{"newest": 281474976710656, "latest": []}',
+        '{"newest": 1, "latest": [[1, 1, 1, -1]]}',
+        '{"newest": 1, "latest": [[1, 1]]}',
     ],
 )
-def test_a_file_without_times_of_this_key_is_named_and_begun_anew(
+def test_a_file_without_times_is_named_and_begun_anew(
     tmp_path: Path, text: str
 ) -> None:
     path = tmp_path / "signing.json"
-    SigningFile(path, KEY).close()
-    mark = json.loads(path.read_text())["key"]
-    assert mark not in KEY.hex()
-    path.write_text(text.replace("KEY", mark))
-    file = SigningFile(path, KEY)
+    path.write_text(text)
+    file = SigningFile(path)
     assert file.written == SigningTimes()
     assert (
         file.trouble
-        == f"signing times {path} holds no times of messages signed with this key: begun anew"
+        == f"signing times {path} holds no times of signed messages: begun anew"
     )
     times = SigningTimes(5, (((0, 1, 1), 4),))
     for second in range(3):
         file.keep(times, (1 + second) * NS)
     file.close()
-    assert SigningFile(path, KEY).written == times
+    assert SigningFile(path).written == times
+
+
+def test_keys_have_marks_of_their_own_that_do_not_reveal_them() -> None:
+    marks = {mark_of(KEY), mark_of(bytes(32))}
+    assert len(marks) == 2
+    assert not any(mark in KEY.hex() for mark in marks)
 
 
 def test_times_are_written_every_five_seconds(tmp_path: Path) -> None:
     path = tmp_path / "signing.json"
-    file = SigningFile(path, KEY)
+    file = SigningFile(path)
     written = set()
     for step in range(1, 121):
         file.keep(SigningTimes(step), NS + step * NS // 10)
@@ -473,7 +480,7 @@ def test_times_are_written_every_five_seconds(tmp_path: Path) -> None:
         written.add(file.written.newest)
     assert sorted(written) == [0, 51, 101]
     file.close()
-    assert SigningFile(path, KEY).written.newest == 120
+    assert SigningFile(path).written.newest == 120
 
 
 def test_a_message_of_another_system_hides_no_answer_of_the_autopilot() -> None:
