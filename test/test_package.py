@@ -139,7 +139,9 @@ def test_the_installed_command_runs_and_finds_its_files_without_a_clone(
     done = run(["bash", "-c", script], tmp_path)
     shipped = install / "share" / "fdi_ros" / "config" / "two_imus.yaml"
     assert done.stdout.startswith(f"{shipped}\n6 channels")
-    assert done.stderr == f"fdi: no config/two_imus.yaml here, taking {shipped}\n"
+    assert done.stderr == (
+        f"fdi: there is no config/two_imus.yaml here: taking the shipped {shipped}\n"
+    )
 
 
 REFUSES = """

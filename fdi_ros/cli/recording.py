@@ -90,9 +90,7 @@ def _mount_findings(
     if start is None or start.mounted or one_clock(candidates(reports)):
         return
     if turned := turned_units(bag, Config.from_parameters(start.parameters)):
-        words = (
-            f"{turned}; the config has them parallel, `fdi setup` measures the mounts"
-        )
+        words = f"{turned}; a config of `fdi inspect` has them parallel, `fdi setup` measures the mounts"
         yield Finding(Role.WARNING, "mounts", words, headline="READY, BUT LOOK")
 
 

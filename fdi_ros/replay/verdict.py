@@ -166,7 +166,7 @@ def _verdict_on_faults(judgement: Judgement) -> ReplayVerdict:
     )
     if unexplained:
         first = unexplained[0]
-        score = f"NOT INJECTED: {_who(first)} {_when(first)}. {score}"
+        score = f"DECLARED BUT NOT INJECTED: {_who(first)} {_when(first)}. {score}"
     return ReplayVerdict(word, score, tuple(names))
 
 

@@ -998,8 +998,8 @@ def _sections(
     proof = found.proof
     result = found.calibration
     first = verdict_of(findings)
-    hint = f"Replay of {proof.source}: unchanged, then with a bias injected on each channel at {TIMES} times."
-    hint += f" Isolated: within {WITHIN:g} s."
+    hint = f"Replays of {proof.source}: one unchanged, and others with a bias on one channel, from {TIMES} times on."
+    hint += f" Isolated: that channel alone is declared within {WITHIN:g} s."
     bag = shlex.quote(bag)
     config = shlex.quote(config)
     is_bad = first.severity is Severity.BAD
@@ -1007,7 +1007,7 @@ def _sections(
     if is_bad:
         first_step = "shows the trouble; do not fly with this config"
     steps = [
-        f"fdi replay {bag} --config {config} --report replay.html   # {first_step}",
+        f"fdi replay {bag} --config {config} --report verdict.html   # {first_step}",
         f"fdi sweep {bag} --config {config} --report sweep.html     # which faults the monitor would find in it",
         f"fdi calibrate ANOTHER_BAG --config {config} --output better.yaml   # with rest, and turns about every axis",
         f"fdi_node --ros-args --params-file {config}   # on the vehicle; in a workspace: ros2 run fdi_ros fdi_node ...",

@@ -54,7 +54,10 @@ def resolve(path: str) -> Path:
     given = Path(path)
     found = find_shipped(given)
     if found != given:
-        print(visible(f"fdi: no {given} here, taking {found}"), file=sys.stderr)
+        print(
+            visible(f"fdi: there is no {given} here: taking the shipped {found}"),
+            file=sys.stderr,
+        )
     return found
 
 

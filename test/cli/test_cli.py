@@ -198,7 +198,7 @@ def test_of_several_configs_the_later_wins_and_shipped_ones_go_by_name(
         )
         return fdi(verb, *given, *words, "--quiet")
 
-    taken = f"fdi: no two_imus.yaml here, taking {root / 'config' / 'two_imus.yaml'}\n"
+    taken = f"fdi: there is no two_imus.yaml here: taking the shipped {root / 'config' / 'two_imus.yaml'}\n"
     code, _, said = called("two_imus.yaml", "good.yaml", "bad.yaml")
     assert (code, said) == (
         2,
