@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tables of text (.csv): a line of column names, then a line per sample.
+"""Tables of text (.csv, .tsv): a line of column names, then a line per sample.
 
 Names give the columns of time and of the rates about x, y and z of each IMU, with
 units: ``time_us``, ``gyro_1_x [deg/s]``, ``imu_0.x``. Names such as ``accel_1_x [g]``
@@ -131,7 +131,7 @@ class CsvLog(FlightLog):
     """An open table, read in portions."""
 
     magic = b""
-    refusal = "is no table of text (.csv)"
+    refusal = "is no table of text (.csv, .tsv)"
     kinds = (KIND,)
     settings = (
         f"does the name of the time have its unit (time_ms), or {COLUMNS} a time_unit,"

@@ -250,10 +250,11 @@ class BagFile(ABC):
 
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-LOG_SUFFIXES = (".bin", ".ulg", ".ulog", ".tlog", ".csv", ".bag")
+TABLE_SUFFIXES = (".csv", ".tsv")
+LOG_SUFFIXES = (".bin", ".ulg", ".ulog", ".tlog", ".bag", *TABLE_SUFFIXES)
 """Suffixes, in any case, of flight logs, tables and ROS 1 bags: single-file recordings."""
 EXPECTED = (
-    "a rosbag2 folder, a .mcap, .db3, .bag, .csv, .bin, .ulg, .ulog or .tlog file"
+    "a rosbag2 folder, a .mcap, .db3, .bag, .csv, .tsv, .bin, .ulg, .ulog or .tlog file"
 )
 #: first bytes of the placeholder that git-lfs leaves for a large file
 LFS = b"version https://git-lfs."
@@ -294,7 +295,9 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
             for child in path.iterdir()
         )
         more = ": name one of its flight logs, or run fdi fleet on it" if logs else ""
-        raise BagError(f"{path} is a folder without .mcap, .db3 or .csv files{more}")
+        raise BagError(
+            f"{path} is a folder without .mcap, .db3, .csv or .tsv files{more}"
+        )
     if len(paths) > FILES:
         damage.add(
             f"{len(paths)} files, expected at most {FILES}: the others were left out"
@@ -337,11 +340,11 @@ def name_of_recording(path: Path) -> str:
 
 
 def tables_of(folder: Path) -> tuple[Path, ...]:
-    """Return the tables (.csv) of a folder without a bag, by name."""
+    """Return the tables (.csv, .tsv) of a folder without a bag, by name."""
     names = sorted(os.listdir(folder), key=natural_order)
     if any(name == "metadata.yaml" or name.endswith(SUFFIXES) for name in names):
         return ()
-    tables = [folder / name for name in names if name.lower().endswith(".csv")]
+    tables = [folder / name for name in names if name.lower().endswith(TABLE_SUFFIXES)]
     return tuple(one for one in tables if one.is_file())
 
 

@@ -58,6 +58,7 @@ FORMATS: dict[str, type[BagFile]] = {
     ".bin": DataflashLog,
 } | {
     ".csv": CsvLog,
+    ".tsv": CsvLog,
     ".tlog": Tlog,
     ".ulg": Ulog,
     ".ulog": Ulog,
@@ -95,7 +96,7 @@ class Recording:
     """An open recording, to be closed or used in a with statement.
 
     ``path``: rosbag2 folder, folder of tables, or a file: .mcap, .db3, .bag (ROS 1),
-    .csv, .bin (ArduPilot), .ulg (PX4) or .tlog (ground stations). `BagError` if nothing
+    .csv, .tsv, .bin (ArduPilot), .ulg (PX4) or .tlog (ground stations). `BagError` if nothing
     readable is found.
     """
 

@@ -71,7 +71,7 @@ DETECTOR_NAMES = ", ".join(reversed(DETECTORS))
 """Names of the detectors for the help, the default first."""
 SHARED_ARGUMENTS: Mapping[str, Options] = {
     "bag": takes_path(
-        "rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file",
+        "rosbag2 folder, or one .mcap, .db3, .bag, .csv, .tsv, .bin, .ulg or .tlog file",
         metavar="BAG",
     ),
     "--config": takes_path(
@@ -590,6 +590,7 @@ def _refuse(parser: argparse.ArgumentParser, verb: str, words: Sequence[str]) ->
             if option.startswith("-")
         ]
         hint = did_you_mean(unknown.partition("=")[0], [*options, "--help"])
+        parser.usage = f"fdi {verb} [OPTION ...]"
         parser.error(f"fdi {verb} has no option {unknown!r}, {hint}")
     is_cut = any("=" in word for word in words)
     hint = ". Write a value with blanks in quotes" if is_cut else ""

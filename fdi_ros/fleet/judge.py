@@ -23,6 +23,7 @@ from fdi_ros.bag.raw import (
     LFS,
     LOG_SUFFIXES,
     SUFFIXES,
+    TABLE_SUFFIXES,
     Damage,
     files_of_bag,
     find_files,
@@ -118,11 +119,11 @@ def _is_recording(path: Path, unread: list[str]) -> bool:
         return False
     if not name.endswith(LOG_SUFFIXES):
         return True
-    # Firmware is called .bin, too, and any table .csv.
+    # Firmware is called .bin, too, and any table .csv or .tsv.
     magic = FORMATS[suffix].magic
     try:
         with open_regular(path) as file:
-            if suffix == ".csv":
+            if suffix in TABLE_SUFFIXES:
                 return has_gyros(file)
             begin = file.read(len(LFS))
     except OSError:

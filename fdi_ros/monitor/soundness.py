@@ -389,7 +389,10 @@ def _alike(
 
 def _unchecked(some: Sequence[ChannelHealth]) -> list[Concern]:
     least = min((one.checked for one in some), default=0.0)
-    words = f"could be checked in only {percent(least)} of the samples"
+    share = percent(least)
+    words = f"could be checked in only {share} of the samples"
+    if share == percent(0.0):
+        words = "could not be checked"
     return _alike(some, Word.CANNOT_TELL, Trouble.UNCHECKED, words)
 
 

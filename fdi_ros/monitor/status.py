@@ -265,10 +265,11 @@ def status_of(
     begun = bool(core["samples"])
     state = core["state"][:n]
     repeated = flags_of(int(core["copies"]["channels"]), n)
+    checked = state != ChannelState.UNCHECKED
     detectable, isolable, note, rests_on = _capability(
-        detector, ~(np.isin(state, LOST_STATES) | repeated)
+        detector, ~(np.isin(state, LOST_STATES) | repeated), checked
     )
-    seen = detectable & (state != ChannelState.UNCHECKED)
+    seen = detectable & checked
     well = mask_of(
         np.flatnonzero((state == ChannelState.OK) | (state == ChannelState.UNCHECKED))
     )
@@ -368,10 +369,13 @@ def _named(names: Sequence[str], marked: Mask) -> tuple[str, ...]:
     return tuple(names[i] for i in np.flatnonzero(marked).tolist())
 
 
-def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
+def _capability(
+    detector: Detector, mask: Mask, checked: Mask
+) -> tuple[Mask, Mask, str, str]:
     """Return whether a fault of each channel would be detected, and isolated, (n,).
 
-    Also limits and assumptions in words.
+    Also limits and assumptions in words. mask: the channels in use, (n,). checked: those that
+    the others check now, (n,): of the rest nothing is said to be seen.
     """
     detectable, isolable = np.zeros((2, len(mask)), dtype=bool)
     try:
@@ -386,7 +390,7 @@ def _capability(detector: Detector, mask: Mask) -> tuple[Mask, Mask, str, str]:
     isolable[mask] = method.isolable
     limits = (
         (mask & ~detectable, "not be seen"),
-        (detectable & ~isolable, "be seen, but not isolated"),
+        (detectable & ~isolable & checked, "be seen, but not isolated"),
     )
     names = detector.geometry.channel_names
     notes = [

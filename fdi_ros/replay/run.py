@@ -439,7 +439,7 @@ def read(
     Parameters
     ----------
     path
-        rosbag2 folder, or one .mcap, .db3, .bag, .csv, .bin, .ulg or .tlog file.
+        rosbag2 folder, or one .mcap, .db3, .bag, .csv, .tsv, .bin, .ulg or .tlog file.
     config
         Settings, or a ROS 2 parameter file. None: the settings that ``fdi inspect`` writes.
     start, end

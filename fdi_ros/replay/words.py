@@ -416,9 +416,7 @@ def fault_sections(scores: Scores, unit: Unit = RADIANS) -> list[Section]:
             unit.words(effect.without_monitor),
         ),
     ]
-    hint = (
-        "Difference (rms) from a replay without the faults; without saturated samples."
-    )
+    hint = "RMS difference from a replay without the faults. Saturated samples do not count."
     faults = Section("Injected faults", "", head_and_rows(columns, scores.faults))
     if not any(astuple(effect)):
         # The faults are in accelerometers alone.

@@ -833,6 +833,14 @@ def _beyond_error(values: Array, errors: Array, factor: float, form: str) -> lis
     ]
 
 
+def _error_of(values: Array, errors: Array, factor: float, form: str) -> list[str]:
+    """Format the standard errors (n,) of values that are beyond theirs."""
+    return [
+        f"{error * factor:{form}}" if abs(value) > error else "-"
+        for value, error in zip(values, errors, strict=True)
+    ]
+
+
 def channel_columns(result: ChannelFit, unit: Unit = RADIANS) -> list[Column]:
     """Figures of every channel, one row each."""
     found = result.estimate
@@ -864,12 +872,18 @@ def channel_columns(result: ChannelFit, unit: Unit = RADIANS) -> list[Column]:
             _beyond_error(result.angle, result.angle_error, degrees, ".3f"),
             ("from nominal deg",),
         ),
-        Column("angle_std_rad", result.angle_error, ("+-deg",), ".3f", degrees),
+        Column("angle_std_rad", result.angle_error),
+        Column(
+            "",
+            _error_of(result.angle, result.angle_error, degrees, ".3f"),
+            ("+-deg",),
+        ),
         Column("bias", found.bias),
         Column(
             "", _beyond_error(found.bias, result.bias_std, rate, ".6f"), ("bias rad/s",)
         ),
-        Column("bias_std", result.bias_std, ("+-",), ".6f", rate),
+        Column("bias_std", result.bias_std),
+        Column("", _error_of(found.bias, result.bias_std, rate, ".6f"), ("+-",)),
         Column("noise_std", found.floor.std, ("noise rad/s",), ".5f", rate),
         Column("noise_std_error", found.floor.error, ("+-",), ".5f", rate),
         Column(

@@ -499,6 +499,8 @@ def test_concerns_name_what_is_wrong_and_nothing_else():
         "c repeats the values of a: one sensor, no redundancy",
         "b.x has 5 spikes",
     ]
+    never = ChannelHealth(name="b.x", checked=0.0)
+    assert str(concerns_of([never])[0]) == "b.x could not be checked"
 
 
 def test_what_to_do_is_said_once_for_each_kind_of_trouble():

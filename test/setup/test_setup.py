@@ -106,6 +106,9 @@ def test_setup_makes_a_config_that_finds_faults(fdi, refused, tmp_path):
     assert code == 0
     assert "mounts: 1 of 1 measured relative to imu_1" in out
     assert re.search(r"^new +nothing", out, re.MULTILINE)
+    # What is within its standard error is no figure, and has none.
+    angles = re.findall(r"^imu_\d\.\w .* not measured +(\S+)", out, re.MULTILINE)
+    assert set(angles) == {"-"}
     assert "imu_1 is assumed to be mounted along the body axes" in out
     names = ("cone.yaml", "cone.html", "cone.json")
     assert out.endswith("".join(f"wrote {tmp_path / name}\n" for name in names))
