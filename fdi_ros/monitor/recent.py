@@ -123,6 +123,7 @@ class RecentHealth:
                 own_noise_rad_s=None if noisy else noise[i],
                 measured_in=one.unit,
                 drift=status.drift_since_rest(one),
+                scale=status.certain_scale_error(one),
             )
 
     def _was_noisy(self, status: Status, channel: ChannelStatus) -> bool:

@@ -46,6 +46,9 @@ So a noise below a third of that of all parallel channels counts as a third."""
 LEAST_DRIFT_RAD_S = 0.02
 """Move of the bias of a gyro that is reported, rad/s. It is 1.4 mrad/s at most in 12 recordings
 without a known fault, up to 20 mrad/s where sensors warm up in simulation, and 30 mrad/s before a real crash."""
+MOSTLY = 0.7
+"""Share of the largest scale error from which on a channel is named with it: of two channels that
+differ, both have half of the difference."""
 LEAST_SPIKES = 3
 """Spikes from which on they are reported. Fewer may be chance."""
 
@@ -92,6 +95,8 @@ class ChannelHealth:
     """Unit of its figures: rad/s of a gyro, m/s^2 of an accelerometer."""
     drift: float = 0.0
     """Move of its bias since it was learned at rest, in `measured_in`. 0: not learned."""
+    scale: float = 0.0
+    """Certain scale error against the other channels, a share. 0: none is certain."""
     doubt: str = ""
     """Why it is not used at the end, as it continues the name: ``remained suspected``. Empty: used."""
 
@@ -159,6 +164,7 @@ class Trouble(Enum):
     COPY = "give {who} a sensor of its own: check wiring and driver"
     DOUBT = "make a longer recording: the suspicion of {who} is still open"
     DRIFT = "let {who} warm up before the flight; replace it if its bias moves again"
+    SCALE = "check the range that the driver of {who} sets, and measure the scale factors (fdi setup)"
     END_OF_RANGE = "choose a larger range for {who}"
     NO_RATE = "see in the report (--report) what the channels did meanwhile"
     SPIKES = "check wiring and power supply of {who}"
@@ -296,6 +302,7 @@ def concerns_of(
         *_incomplete([one for one in alone if one.delivered < LEAST_DELIVERED]),
         *_doubts([one for one in alone if one.doubt]),
         *_drifted([one for one in channels if _has_drifted(one)]),
+        *_wrong_scale(channels),
         *_at_end_of_range([one for one in channels if one.saturated_s > 0.0]),
         *_rate_concerns(rate),
         *_spiky([one for one in channels if one.spikes >= LEAST_SPIKES]),
@@ -411,6 +418,28 @@ def _drifted(some: Sequence[ChannelHealth]) -> list[Concern]:
     verb = "has a bias that" if len(some) == 1 else "have biases that"
     words = f"{verb} moved by {'up to ' if len(some) > 1 else ''}{figures(most, 2)} rad/s since the start at rest"
     return _alike(some, Word.LOOK, Trouble.DRIFT, words)
+
+
+def _wrong_scale(channels: Sequence[ChannelHealth]) -> list[Concern]:
+    """Return a concern about the channels that read too much or too little.
+
+    The errors of all channels along an axis have a mean of zero, as the true rate is not known: if
+    one of three reads 30 % too much, it is 20 % above the mean, and the others are 10 % below.
+    """
+    most = max((abs(one.scale) for one in channels), default=0.0)
+    odd = [one for one in channels if abs(one.scale) > MOSTLY * most]
+    if not odd:
+        return []
+    low = min(one.scale for one in odd)
+    high = max(one.scale for one in odd)
+    if low < 0.0 < high:
+        words = f"have scale factors that differ by {percent(high - low)}"
+    else:
+        verb = "reads" if len(odd) == 1 else "read"
+        words = (
+            f"{verb} at least {percent(most)} too {'much' if high > 0.0 else 'little'}"
+        )
+    return _alike(odd, Word.LOOK, Trouble.SCALE, words)
 
 
 def _at_end_of_range(some: Sequence[ChannelHealth]) -> list[Concern]:

@@ -358,6 +358,7 @@ class Judge(Walk):
                 since_s=since,
                 reason=reason,
                 drift=status.drift_since_rest(one),
+                scale=status.certain_scale_error(one),
                 noise=one.noise or None,
                 unchecked=unchecked,
             )

@@ -260,6 +260,33 @@ def test_what_nothing_checks_gives_a_rate_and_is_not_called_healthy(
     assert words in status.note
 
 
+@pytest.mark.parametrize(
+    ("units", "share", "wrong"),
+    [
+        (2, 0.0, set()),
+        (2, 0.04, set()),
+        (2, 0.12, {"imu_1.y", "imu_2.y"}),
+        (3, 0.04, set()),
+        (3, -0.12, {"imu_2.y"}),
+    ],
+)
+def test_a_scale_error_that_was_learned_is_told(units, share, wrong):
+    """It is corrected, and declared only if it begins in motion."""
+    settings = {"detector__name": "sequential", "noise__scale_std": 0.01}
+    pipeline = Pipeline(parallel(units, **settings))
+    block = stream(pipeline.geometry, 2000)
+    block.z[:, 4] *= 1.0 + share
+    assert not [event for event in pipeline.process(block).events if event.declares]
+    status = pipeline.status()
+    found = {c.name: status.certain_scale_error(c) for c in status.channels}
+    assert {name for name, size in found.items() if size} == wrong
+    if wrong:
+        # Half of the difference of two, and two thirds of that of one to two others.
+        expected = share * (units - 1) / units
+        assert found["imu_2.y"] == pytest.approx(expected, rel=0.15)
+    assert all(str(error) for error in status.errors)
+
+
 def test_a_detector_that_cannot_run_on_the_channels_left_says_so():
     pipeline = Pipeline(OF_FIVE)
     run(pipeline, 500, "channel=g2 kind=bias size=0.5 start=1")

@@ -503,6 +503,25 @@ def test_concerns_name_what_is_wrong_and_nothing_else():
     assert str(concerns_of([never])[0]) == "b.x could not be checked"
 
 
+@pytest.mark.parametrize(
+    ("scales", "said"),
+    [
+        ((0.0, 0.0, 0.0), []),
+        ((-0.06, 0.12, -0.06), ["b.x reads at least 12 % too much"]),
+        ((0.0, -0.08, 0.0), ["b.x reads at least 8 % too little"]),
+        ((0.05, -0.05, 0.0), ["a.x and b.x have scale factors that differ by 10 %"]),
+    ],
+)
+def test_wrong_scale_factors_are_those_of_the_odd_one_or_of_two_that_differ(
+    scales, said
+):
+    some = [
+        ChannelHealth(name=f"{unit}.x", unit=unit, scale=scale)
+        for unit, scale in zip("abc", scales, strict=True)
+    ]
+    assert [str(one) for one in concerns_of(some)] == said
+
+
 def test_what_to_do_is_said_once_for_each_kind_of_trouble():
     some = [
         ChannelHealth(name="a.x", unit="a", spikes=5),
