@@ -8,7 +8,7 @@ comparison does neither and shows the present difference of the autopilot's own 
 
 Two of three IMUs can be wrong alike: both stand still, or both are remembered as faulty. So
 they outvote the third on an axis only if they are trusted (`TRUSTED`) or have shown the same turn
-about it since they were found bad on another axis, if their values change, and if
+about it since they were found bad on another axis, if both have moved of late, and if
 the monitor has no doubt about them that it does not have about the third as well. Two that
 were both taken out in this flight outvote one that was not only once both are back, and have
 agreed in turns about all axes.
@@ -40,17 +40,14 @@ DECAY = 0.5
 REFUTING = 300 * MS  #: Agreement refutes a doubt that has stood for this time, ns.
 BREAK = 100 * MS  #: A shorter break ends no agreement, and no difference, ns.
 HEALED = NS // 2  #: Time of agreement after which an earlier size is forgotten, ns.
-#: A set must stand for this time to name an IMU, ns, and a name that comes with a difference
-#: is no older than it by more.
+#: A set must stand for this time to name an IMU, ns, and a name is for a difference that
+#: began at most this time after it.
 SET_STANDS = 300 * MS
 LONGEST_BREAK = 200 * MS  #: A set stands over a break of this length, ns.
 #: Least error of the odd one in a set of several IMUs, or suspected, and of one that is
 #: compared with only one other IMU, in ``min_size``.
 VOTE = 2.0
 SUSPECT_STANDS = NS  #: An IMU must be suspected, and the odd one, for this time, ns.
-#: A difference that is younger than the name must stand for this time, ns. The monitor doubts an IMU
-#: that is off by 0.1 rad/s after 0.06 to 0.12 s, and its states are up to 0.2 s old.
-DOUBT_TAKES = NS // 2
 #: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
 #: 0.2 s to exclude a spike. An autopilot whose primary gyro reads zero is at 50 deg then.
 CLEAR_DIFFERENCE = 0.5
@@ -71,6 +68,14 @@ SHOWN = 2.0
 #: healed ones stay out in a circle.
 SAME_TURN = 0.8
 TINY = 1e-3  #: Resolution of the messages, rad/s.
+#: An axis moves if its mean rate and that of another IMU change alike, by this or more, rad/s. The
+#: mean of 120 ms of a noise of 4 mrad/s at 50 Hz scatters by 0.0016 rad/s.
+MOVES = 0.005
+MOVES_WITHIN = NS  #: Longest time of that change, ns.
+#: An axis that has not moved for this time, ns, may be dead: it is no witness. In the logs of two
+#: hovering quadcopters every axis moved all the time; without wind, in simulation, yaw for 87 %. A
+#: fault that is flown with turns the vehicle, so that the healthy ones move.
+MOVED_FOR = 5 * NS
 #: An oscillation with this standard deviation is an error, rad/s.
 WILD_OSCILLATION = 1.0
 SIZED = 80 * MS  #: The size in a text is averaged over this time, ns.
@@ -149,18 +154,14 @@ class Track:
     bound: float = math.nan  #: A bound on that, rad/s.
     sizes: Vector = UNKNOWN_RATES  #: Largest difference of late, by axis, rad/s.
     partners: Partners = NO_PARTNERS  #: Against these.
-    #: When each axis was last not FAULTY, and not apart enough for one witness.
+    #: When each axis was last not named, or became FAULTY.
     unnamed_at: list[int] = field(default_factory=lambda: [0] * 3)
+    #: When each axis was last apart by less than `VOTE` times ``min_size``.
     near_at: list[int] = field(default_factory=lambda: [0] * 3)
     #: Doubts of the monitor that agreement has refuted. None: the IMU is not trusted.
     refuted: set[ChannelState] | None = None
     doubted: set[ChannelState] = field(default_factory=set)  #: Last doubts.
     doubted_at: int = 0  #: Since when they are these.
-    #: Axes that are FAULTY or in a set, since when the IMU agrees although they are, and
-    #: those for which this has lasted for `TRUSTED`.
-    named: set[int] = field(default_factory=set)
-    named_at: int = 0
-    outdated: set[int] = field(default_factory=set)
     agreed: int | None = None  #: Since when the IMU agrees with another.
     agreed_at: int = 0  #: When the IMU last agreed.
     #: The same, from a turn that shows an error in proportion to the rate.
@@ -173,6 +174,8 @@ class Track:
     shown: set[int] = field(default_factory=set)
     #: Has agreed in a turn since the last time apart from all others.
     has_shown: bool = False
+    moved_at: list[int] = field(default_factory=lambda: [-MOVED_FOR] * 3)
+    moves: set[int] = field(default_factory=set)  #: Axes that have moved of late.
     #: Axes about which it and another IMU have shown the same turn, since the monitor or the
     #: raw rates last found a further axis bad.
     proven: set[int] = field(default_factory=set)
@@ -197,6 +200,10 @@ class Track:
         """Axes that were bad, and have not agreed in a turn that shows this."""
         return self.wrong.keys() - self.shown
 
+    def is_new(self, axis: int) -> bool:
+        """Return whether the name of an axis came with its present difference."""
+        return self.near_at[axis] - self.unnamed_at[axis] < SET_STANDS
+
     def axes(self, *wanted: ChannelState) -> set[int]:
         """Return the axes to which the monitor gives a wanted state."""
         return {axis for axis, state in enumerate(self.states) if state in wanted}
@@ -216,27 +223,6 @@ def _note_sizes(track: Track, agreed: int | None, held: Vector, now: int) -> Non
     else:
         x, y, z = track.nearest
     track.sizes = x, y, z
-
-
-def _note_apart(track: Track, least: float, now: int) -> None:
-    """Note which axes are not FAULTY, or not apart by ``least``, rad/s."""
-    faulty = track.axes(ChannelState.FAULTY)
-    for axis, size in enumerate(track.sizes):
-        if axis not in faulty:
-            track.unnamed_at[axis] = now
-        if size < least:
-            track.near_at[axis] = now
-
-
-def _note_names(track: Track, agreed: int | None, now: int) -> None:
-    """Note which axes were named before the IMU has agreed for long."""
-    named = track.axes(ChannelState.FAULTY, ChannelState.AMBIGUOUS)
-    if agreed is None or named != track.named:
-        track.named = named
-        track.named_at = now
-    elif now - track.named_at >= TRUSTED:
-        track.outdated = named
-    track.outdated = track.outdated & named
 
 
 def _compared(
@@ -302,6 +288,8 @@ class Evidence:
         self._odd_since = 0
         self._odd_seen = 0
         self._looked = 0
+        self._turns: dict[int, Vector] = {}  # mean rates at some time, rad/s
+        self._turned_at = 0  # that time, ns
 
     def remember(self, axes: Mapping[int, str]) -> None:
         """Take the axes on which IMUs were bad before a restart, such as xy.
@@ -322,7 +310,12 @@ class Evidence:
         self.heard = now
         found = [STATES[int(state)] for state in states]
         for k, track in enumerate(self._tracks):
+            before = track.axes(ChannelState.FAULTY)
             track.states = tuple(found[3 * k : 3 * k + 3])
+            declared = track.axes(ChannelState.FAULTY) - before
+            in_sets = track.axes(ChannelState.AMBIGUOUS)
+            for axis in declared | ({0, 1, 2} - before - in_sets):
+                track.unnamed_at[axis] = now
             for axis in track.axes(*JUDGED):
                 track.judged_at[axis] = now
 
@@ -356,6 +349,7 @@ class Evidence:
             k for k in self._taken if k in out or len(self._tracks[k].shown) < 3
         }
         self._compare(units, now)
+        self._note_moves(units, now)
         self._note_trust(units, now)
         odd, accused = self._lasting_odd_one(units, now)
         partners = [self._partners(k, units, out) for k in range(len(delivers))]
@@ -373,13 +367,12 @@ class Evidence:
             kept = self._kept(track, partners[k], held)
             _note_sizes(track, agreed, kept, now)
             track.partners = partners[k]
-            _note_apart(track, VOTE * self._min_size, now)
-            _note_names(track, agreed, now)
+            for axis, size in enumerate(track.sizes):
+                if size < VOTE * self._min_size:
+                    track.near_at[axis] = now
             faulty = track.axes(ChannelState.FAULTY)
             axes = faulty | accused if k == odd else faulty
-            if track.outdated:
-                axes = axes - (track.outdated - self._odd_axes(k, units))
-            blamed = self._blamed_axes(track, axes, partners[k], now)
+            blamed = self._blamed_axes(k, axes, units)
             if k in out or blamed:
                 self._note_wrong(track, partners[k], axes)
             elif agreed is not None and now - agreed >= HEALED:
@@ -466,6 +459,24 @@ class Evidence:
                 # Of a lossy link: the last values hold.
                 continue
             self._pairs[j, k] = self._pairs[k, j] = found
+
+    def _note_moves(self, units: Sequence[int], now: int) -> None:
+        """Note which axes move as those of another IMU do."""
+        turns = {k: self.raw.motion(k).mean for k in units}
+        if now - self._turned_at >= MOVES_WITHIN:
+            self._turned_at = now
+            self._turns = turns
+        for pair in combinations(turns.keys() & self._turns.keys(), 2):
+            for axis in range(3):
+                one, other = (turns[k][axis] - self._turns[k][axis] for k in pair)
+                least = abs(nearest_zero((one, other)))
+                if least >= MOVES and abs(one - other) <= least:
+                    for k in pair:
+                        self._tracks[k].moved_at[axis] = now
+        for track in self._tracks:
+            track.moves = {
+                axis for axis, at in enumerate(track.moved_at) if now - at < MOVED_FOR
+            }
 
     def _note_trust(self, units: Sequence[int], now: int) -> None:
         """Note whether all IMUs agree, and which are apart from all others."""
@@ -665,28 +676,28 @@ class Evidence:
         )
         return x, y, z
 
-    def _blamed_axes(
-        self, track: Track, axes: set[int], partners: Partners, now: int
-    ) -> set[int]:
-        """Return the axes on which an IMU, named on these axes, is apart.
+    def _blamed_axes(self, unit: int, axes: set[int], units: Sequence[int]) -> set[int]:
+        """Return the axes on which an IMU, named on these axes, is apart and the bad one.
 
-        Of two IMUs either may be wrong, or both by less than ``min_size``. So the monitor must
-        not doubt that axis of the other one, and the difference must be `VOTE` times as large.
-        Of a name that is older than the difference, the monitor may have yet to doubt the other
-        one: the difference must stand for `DOUBT_TAKES`, or for `SET_STANDS` from
-        `CLEAR_DIFFERENCE` on.
+        If two others outvote it, its name may be for an earlier error. Otherwise it may be the
+        others that are wrong, or each by less than ``min_size``: its name must have come with this
+        difference, which is `VOTE` times as large, and the monitor must not doubt that axis of
+        those that it is compared with. One of these must move. While all others are out of use,
+        all that counts is whether the last one is better.
         """
+        track = self._tracks[unit]
+        sure = self._odd_axes(unit, units) if track.partners.are_fit else axes
         blamed = set()
         for axis in axes:
-            witness = partners.witness(axis)
             least = self._min_size
-            if witness is not None:
+            if axis not in sure:
                 least *= VOTE
-                if axis in self._tracks[witness].axes(*DOUBTS):
+                others = [self._tracks[k] for k in track.partners.on[axis]]
+                is_doubted = any(axis in other.axes(*DOUBTS) for other in others)
+                moves = any(axis in other.moves for other in others)
+                if is_doubted or not moves or not track.is_new(axis):
                     continue
-                if self._is_early(track, axis, now):
-                    continue
-            if track.sizes[axis] >= least:
+            if track.nearest[axis] >= least:
                 blamed.add(axis)
         return blamed
 
@@ -705,13 +716,6 @@ class Evidence:
             kept.append(share if is_same and not is_doubted else 0.0)
         x, y, z = kept
         return x, y, z
-
-    def _is_early(self, track: Track, axis: int, now: int) -> bool:
-        """Return whether an axis was named before it was apart, and the other may be doubted yet."""
-        near_at = track.near_at[axis]
-        is_clear = track.sizes[axis] >= CLEAR_DIFFERENCE
-        takes = SET_STANDS if is_clear else DOUBT_TAKES
-        return near_at - track.unnamed_at[axis] >= SET_STANDS and now - near_at < takes
 
     def _is_trusted(self, unit: int) -> bool:
         return self._tracks[unit].refuted is not None
@@ -773,20 +777,23 @@ class Evidence:
         return axes
 
     def _vouched_axes(self, unit: int, accused: Track) -> set[int]:
-        """Return the axes on which an IMU may vote against another.
+        """Return the axes that move and on which an IMU may vote against another.
 
-        All, if it is trusted. Else the proven ones on which the monitor does not doubt it, or
-        doubts the other one alike. Names are older than the proof, and refuted by it.
+        All of them, if it is trusted. Else the proven ones on which the monitor does not doubt
+        it, or doubts the other one alike, or names it anew. Names of this one are older than the
+        proof, and refuted by it.
         """
         track = self._tracks[unit]
         if track.refuted is not None and track.doubts <= track.refuted | accused.doubts:
-            return {0, 1, 2}
+            return track.moves
+        named = accused.axes(ChannelState.FAULTY)
         doubted = {
             axis
             for axis in track.axes(*DOUBTS - {ChannelState.FAULTY})
             if track.states[axis] is not accused.states[axis]
+            and not (axis in named and accused.is_new(axis))
         }
-        return track.proven - doubted
+        return (track.proven & track.moves) - doubted
 
     def _odd_one(self, units: Sequence[int], now: int) -> tuple[int, set[int], int]:
         """Return an IMU that is bad although the monitor does not name it.

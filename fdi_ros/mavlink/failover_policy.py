@@ -14,13 +14,15 @@ Definitions
              both may add up
     proven   on an axis: it and another IMU have shown the same turn about it since the monitor or
              the raw rates last found it bad on a further axis. So it is not dead
+    moves    on an axis: within 5 s its rate has changed as that of another IMU has
     named    by the monitor, now or in its last report if that is not old, or by the raw
              rates: two of three IMUs agree, and the third is far off
-    blamed   named on an axis that is apart. If only one other IMU can be compared: by twice
-             as much, for 0.5 s if the name is older than that by 0.3 s (for 0.3 s from
-             0.5 rad/s on), and the monitor does not doubt that axis of the other one. A name
-             from before the IMU last agreed counts only while two of three IMUs agree, and
-             this one does not
+    blamed   named on an axis that is apart now, and one of two
+             a. outvoted: two others agree on that axis, both move, each is trusted or proven,
+                and the monitor does not doubt them
+             b. the name came with this difference: it is at most 0.3 s older than twice
+                ``min_size``. The monitor doubts that axis of no IMU that counts there, and
+                one of these moves
     bad      blamed, and delivers. Else left in use.
     alive    delivers samples, and they change while other IMUs turn
     sound    alive, and the monitor finds all its axes OK, or it is not apart

@@ -977,9 +977,12 @@ def test_a_lesser_error_is_better_than_none_sound(flying: Monitored) -> None:
 
 
 def test_a_step_at_rest_says_nothing_of_the_others(moving: Moving) -> None:
-    """As in the check list of the docs: an offset of IMU 2, armed on the ground."""
-    talk, _ = moving(0.0, 0.0, 0.0, noise=0.0003)
+    """As in the check list of the docs: an offset of IMU 2, armed on the ground, and a turn."""
+    talk, motion = moving(0.0, 0.0, 0.0, noise=0.0003)
     talk.fault(2, 0.3, seconds=10.0)
+    assert talk.in_use == [True, True, True]
+    motion.rate[1] = 0.1
+    talk.run(1.0)
     assert talk.in_use == [True, False, True]
     assert not any("IMU 3" in text or "IMU 1" in text for text in talk.texts)
 
