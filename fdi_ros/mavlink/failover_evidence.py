@@ -121,11 +121,6 @@ class Partners(NamedTuple):
     common: Set[int] = frozenset()  #: On all axes.
     are_fit: bool = False  #: They are in use, trusted or proven.
 
-    def witness(self, axis: int) -> int | None:
-        """Return the only IMU that is a measure on an axis, or None."""
-        found = self.on[axis]
-        return min(found) if self.are_fit and len(found) == 1 else None
-
 
 NO_PARTNERS = Partners()
 
@@ -153,7 +148,7 @@ class Track:
     nearest: Vector = UNKNOWN_RATES  #: Difference to the nearest partner, rad/s.
     bound: float = math.nan  #: A bound on that, rad/s.
     sizes: Vector = UNKNOWN_RATES  #: Largest difference of late, by axis, rad/s.
-    partners: Partners = NO_PARTNERS  #: Against these.
+    partners: Partners = NO_PARTNERS
     #: When each axis was last not named, or became FAULTY.
     unnamed_at: list[int] = field(default_factory=lambda: [0] * 3)
     #: When each axis was last apart by less than `VOTE` times ``min_size``.
@@ -215,13 +210,14 @@ def _worst(sizes: Vector, blamed: set[int]) -> str:
     return AXES[axis] if axis in blamed else ""
 
 
-def _note_sizes(track: Track, agreed: int | None, held: Vector, now: int) -> None:
-    """Note the sizes of late. held: the share that is left of the last ones, by axis."""
-    if agreed is None or now - agreed < HEALED:
-        before = (share * size for share, size in zip(held, track.sizes, strict=True))
-        x, y, z = map(max, track.nearest, before)
-    else:
-        x, y, z = track.nearest
+def _note_sizes(track: Track, agreed: int | None, share: float, now: int) -> None:
+    """Note the sizes of late. share: what is left of the last ones."""
+    is_healed = agreed is not None and now - agreed >= HEALED
+    kept = 0.0 if is_healed else share
+    x, y, z = (
+        max(new, kept * old)
+        for new, old in zip(track.nearest, track.sizes, strict=True)
+    )
     track.sizes = x, y, z
 
 
@@ -352,21 +348,19 @@ class Evidence:
         self._note_moves(units, now)
         self._note_trust(units, now)
         odd, accused = self._lasting_odd_one(units, now)
-        partners = [self._partners(k, units, out) for k in range(len(delivers))]
         for k, track in enumerate(self._tracks):
-            track.nearest = self._nearest(k, partners[k])
-            bounds = [max(self._pairs[k, j].bound) for j in partners[k].common]
+            track.partners = self._partners(k, units, out)
+            track.nearest = self._nearest(k, track.partners)
+            bounds = [max(self._pairs[k, j].bound) for j in track.partners.common]
             track.bound = min(bounds, default=math.nan)
         elapsed = now - self._looked
         held = math.exp(-elapsed / NS / DECAY)
         self._looked = now
         imus = []
         for k, track in enumerate(self._tracks):
-            common = partners[k].common
+            common = track.partners.common
             agreed = self._note_agreement(k, common, k in out, now, elapsed)
-            kept = self._kept(track, partners[k], held)
-            _note_sizes(track, agreed, kept, now)
-            track.partners = partners[k]
+            _note_sizes(track, agreed, held, now)
             for axis, size in enumerate(track.sizes):
                 if size < VOTE * self._min_size:
                     track.near_at[axis] = now
@@ -374,7 +368,7 @@ class Evidence:
             axes = faulty | accused if k == odd else faulty
             blamed = self._blamed_axes(k, axes, units)
             if k in out or blamed:
-                self._note_wrong(track, partners[k], axes)
+                self._note_wrong(track, track.partners, axes)
             elif agreed is not None and now - agreed >= HEALED:
                 track.wrong.clear()
             is_known = track.states or k == odd
@@ -700,22 +694,6 @@ class Evidence:
             if track.nearest[axis] >= least:
                 blamed.add(axis)
         return blamed
-
-    def _kept(self, track: Track, partners: Partners, share: float) -> Vector:
-        """Return which share is left of the last sizes, by axis: none if they may be others' errors.
-
-        They are those against the same partners, of which one alone was not in doubt.
-        """
-        kept = []
-        for axis in range(3):
-            witness = partners.witness(axis)
-            is_doubted = witness is not None and axis in self._tracks[witness].axes(
-                *DOUBTS
-            )
-            is_same = track.partners.on[axis] == partners.on[axis]
-            kept.append(share if is_same and not is_doubted else 0.0)
-        x, y, z = kept
-        return x, y, z
 
     def _is_trusted(self, unit: int) -> bool:
         return self._tracks[unit].refuted is not None
