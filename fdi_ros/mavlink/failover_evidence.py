@@ -169,10 +169,10 @@ class Track:
     shown: set[int] = field(default_factory=set)
     #: Has agreed in a turn since the last time apart from all others.
     has_shown: bool = False
+    #: When the last motion of each axis began.
     moved_at: list[int] = field(default_factory=lambda: [-MOVED_FOR] * 3)
     moves: set[int] = field(default_factory=set)  #: Axes that have moved of late.
-    #: Axes about which it and another IMU have shown the same turn, since the monitor or the
-    #: raw rates last found a further axis bad.
+    #: Those that have done so since the monitor or the raw rates last found a further axis bad.
     proven: set[int] = field(default_factory=set)
     bad: set[tuple[int, bool]] = field(default_factory=set)  #: Axes, and by whom.
     unproven_at: int = 0  #: When the last one was found.
@@ -466,7 +466,7 @@ class Evidence:
                 least = abs(nearest_zero((one, other)))
                 if least >= MOVES and abs(one - other) <= least:
                     for k in pair:
-                        self._tracks[k].moved_at[axis] = now
+                        self._tracks[k].moved_at[axis] = self._turned_at
         for track in self._tracks:
             track.moves = {
                 axis for axis, at in enumerate(track.moved_at) if now - at < MOVED_FOR
@@ -508,9 +508,9 @@ class Evidence:
             self._note_proven(k, units, now)
 
     def _note_proven(self, unit: int, units: Sequence[int], now: int) -> None:
-        """Note the axes on which an IMU and another one have shown the same turn.
+        """Note the axes on which an IMU is known to measure.
 
-        An IMU that is found bad on a further axis may be dead: this counts anew on all.
+        One that is found bad on a further axis may be dead: this counts anew on all.
         """
         track = self._tracks[unit]
         pairs = {k: self._pairs[unit, k] for k in units if k != unit}
@@ -522,22 +522,13 @@ class Evidence:
         }
         bad = named | {(axis, False) for axis in off}
         if not bad <= track.bad:
-            track.proven.clear()
             track.unproven_at = now
         track.bad = bad
         track.off |= off
-        if now - track.unproven_at < REFUTING:
-            # What is averaged may be from before.
-            return
-        turn = self.raw.motion(unit).mean
-        for k, pair in pairs.items():
-            other = self.raw.motion(k).mean
-            track.proven |= {
-                axis
-                for axis in {0, 1, 2} - track.off
-                if pair.bound[axis] < self._min_size
-                and min(abs(turn[axis]), abs(other[axis])) >= TURN_RATE
-            }
+        # What is averaged may be from before.
+        since = track.unproven_at + REFUTING
+        moves = track.moves - track.off
+        track.proven = {axis for axis in moves if track.moved_at[axis] >= since}
 
     def _note_agreement(
         self,
