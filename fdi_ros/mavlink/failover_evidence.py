@@ -7,8 +7,8 @@ The monitor removes learned errors from the samples and remembers declarations. 
 comparison does neither and shows the present difference of the autopilot's own gyros.
 
 Two of three IMUs can be wrong alike: both stand still, or both are remembered as faulty. So
-they outvote the third on an axis only if they are trusted (`TRUSTED`) or have shown the same turn
-about it since they were found bad on another axis, if both have moved of late, and if
+they outvote the third on an axis only if both have moved of late (`MOVES`), if each is trusted
+(`TRUSTED`) or has moved since it was found bad on another axis, and if
 the monitor has no doubt about them that it does not have about the third as well. Two that
 were both taken out in this flight outvote one that was not only once both are back, and have
 agreed in turns about all axes.

@@ -12,13 +12,13 @@ Definitions
     apart    on an axis: raw rate differs by ``min_size`` or more, and more than scales explain,
              from the nearest IMU that is in use, trusted, or proven on this axis. The errors of
              both may add up
-    proven   on an axis: it and another IMU have shown the same turn about it since the monitor or
-             the raw rates last found it bad on a further axis. So it is not dead
     moves    on an axis: within 5 s its rate has changed as that of another IMU has
+    proven   on an axis: it moves, and has done so since the monitor or the raw rates last found it
+             bad on a further axis. So it is not dead. It was not apart there
     named    by the monitor, now or in its last report if that is not old, or by the raw
              rates: two of three IMUs agree, and the third is far off
     blamed   named on an axis that is apart now, and one of two
-             a. outvoted: two others agree on that axis, both move, each is trusted or proven,
+             a. outvoted: two others agree on that axis. Each is trusted and moves, or proven,
                 and the monitor does not doubt them
              b. the name came with this difference: it is at most 0.3 s older than twice
                 ``min_size``. The monitor doubts that axis of no IMU that counts there, and

@@ -838,6 +838,19 @@ def test_two_that_are_bad_on_an_axis_have_no_vote_there_while_they_agree() -> No
     assert 2 not in watched.blamed(3.0)
 
 
+def test_an_imu_with_a_harmless_error_is_a_witness_in_a_hover() -> None:
+    """It is FAULTY, but moves as the others do. So one of the two that differ is the odd one."""
+    watched = watch()
+    watched.rate = lambda t: 0.015 * np.sin(np.array([3.0, 2.3, 1.1]) * t)
+    watched.run(1.0)
+    watched.gyros[0] = biased(0.008)
+    watched.states[0] = FAULTY
+    watched.run(3.0)
+    watched.gyros[1] = biased(0.25)
+    watched.states[3] = watched.states[6] = AMBIGUOUS
+    assert watched.blamed(1.0) == {1}
+
+
 def test_the_last_gyro_of_an_axis_is_fine_on_the_others() -> None:
     watched = watch()
     watched.gyros[2] = biased(0.3, axis=2)
