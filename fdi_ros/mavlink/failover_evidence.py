@@ -153,6 +153,8 @@ class Track:
     unnamed_at: list[int] = field(default_factory=lambda: [0] * 3)
     #: When each axis was last apart by less than `VOTE` times ``min_size``.
     near_at: list[int] = field(default_factory=lambda: [0] * 3)
+    #: Axes that are apart, and that the monitor has doubted since.
+    questioned: set[int] = field(default_factory=set)
     #: Doubts of the monitor that agreement has refuted. None: the IMU is not trusted.
     refuted: set[ChannelState] | None = None
     doubted: set[ChannelState] = field(default_factory=set)  #: Last doubts.
@@ -364,6 +366,10 @@ class Evidence:
             for axis, size in enumerate(track.sizes):
                 if size < VOTE * self._min_size:
                     track.near_at[axis] = now
+            near = {
+                axis for axis, size in enumerate(track.sizes) if size < self._min_size
+            }
+            track.questioned = (track.questioned | track.axes(*DOUBTS)) - near
             faulty = track.axes(ChannelState.FAULTY)
             axes = faulty | accused if k == odd else faulty
             blamed = self._blamed_axes(k, axes, units)
@@ -389,7 +395,8 @@ class Evidence:
         """Return the axes that the monitor finds OK, such as xy.
 
         Empty if there is another one, unless it is unchecked because all other IMUs are FAULTY
-        there: nothing is left that could show a fault of the last one.
+        there: nothing is left that could show a fault of the last one. Empty if the monitor has
+        doubted an axis since the IMU is apart there: it may have withdrawn that for a moment.
         """
         faulty = [
             track.axes(ChannelState.FAULTY)
@@ -397,6 +404,8 @@ class Evidence:
             if k != unit
         ]
         track = self._tracks[unit]
+        if track.questioned:
+            return ""
         alone = track.axes(ChannelState.UNCHECKED).intersection(*faulty)
         fine = track.axes(ChannelState.OK)
         return "".join(AXES[k] for k in sorted(fine)) if len(fine | alone) == 3 else ""
@@ -410,8 +419,9 @@ class Evidence:
             for axis, at in zip(AXES, track.judged_at, strict=True)
             if now - at >= JUDGED_FOR
         )
+        is_fine = bool(found.fine) and not stuck
         return found._replace(
-            ok=track.is_ok and not stuck,
+            ok=track.is_ok and is_fine,
             stuck=stuck,
             size=max(track.sizes),
             votes=unit not in self._once_bad,

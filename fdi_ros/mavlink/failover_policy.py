@@ -25,7 +25,8 @@ Definitions
                 one of these moves
     bad      blamed, and delivers. Else left in use.
     alive    delivers samples, and they change while other IMUs turn
-    sound    alive, and the monitor finds all its axes OK, or it is not apart
+    OK       by the monitor on all axes, which has doubted none since the IMU is apart there
+    sound    alive, and OK or not apart
     reserve  for a bad IMU: sound. Or alive, OK on the axis on which the bad one is off most, and
              unchecked on others only because all other IMUs are FAULTY there
     trusted  all IMUs have agreed for 2 s since it was last apart. A bad one in use prevents that
@@ -108,7 +109,7 @@ class Imu(NamedTuple):
     named: bool | None = None  #: By the monitor or the raw rates. None: no reports.
     blamed: bool = False  #: Named on an axis that is apart, as defined above.
     worst: str = ""  #: Axis that is off most, if blamed, such as x.
-    ok: bool = False  #: The monitor finds all its channels OK.
+    ok: bool = False  #: OK, as defined above.
     #: Axes that the monitor finds OK, such as xy. Empty if it does not judge another one, unless
     #: all other IMUs are FAULTY there.
     fine: str = ""

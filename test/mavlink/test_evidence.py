@@ -869,6 +869,20 @@ def test_the_last_gyro_of_an_axis_is_fine_on_the_others() -> None:
     assert watched.step()[1].fine == ""
 
 
+def test_an_imu_that_is_apart_is_not_ok_once_it_was_doubted() -> None:
+    """The monitor may withdraw its doubt while the difference lasts."""
+    watched = watch(2)
+    watched.gyros[1] = biased(0.3)
+    watched.states[0] = watched.states[3] = AMBIGUOUS
+    watched.run(0.5)
+    watched.states[0], watched.states[3] = FAULTY, OK
+    imu = watched.run(1.0).step()[1]
+    assert (imu.ok, imu.fine) == (False, "")
+    watched.gyros[1] = sound
+    imu = watched.run(2.0).step()[1]
+    assert (imu.ok, imu.fine) == (True, "xyz")
+
+
 # A name and its size ----------------------------------------------------------------------
 
 
