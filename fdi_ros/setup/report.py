@@ -1012,7 +1012,7 @@ def _sections(
     proof = found.proof
     result = found.calibration
     first = verdict_of(findings)
-    hint = f"Replays of {proof.source}: one unchanged, and others with a bias on one channel, from {TIMES} times on."
+    hint = f"Replays of {proof.source}: one unchanged, and others in which a bias begins on one channel, at {TIMES} times."
     hint += f" Isolated: that channel alone is declared within {WITHIN:g} s."
     bag = shlex.quote(bag)
     config = shlex.quote(config)
