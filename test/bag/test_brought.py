@@ -430,4 +430,4 @@ def test_a_gyro_that_lacks_an_axis_is_said(tmp_path, fdi):
 def test_an_empty_folder_says_what_it_lacks(tmp_path, refused):
     os.mkdir(tmp_path / "empty")
     said = refused("inspect", tmp_path / "empty")
-    assert "is a folder without .mcap, .db3 or .csv files" in said
+    assert "is a folder without .mcap, .db3, .csv or .tsv files" in said

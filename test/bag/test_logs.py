@@ -635,7 +635,7 @@ def test_instances_without_end_are_no_instances(tmp_path):
         (
             "a.log",
             b"FMT, 128",
-            "expected a rosbag2 folder, a .mcap, .db3, .bag, .csv, .bin, .ulg, .ulog or .tlog file",
+            "expected a rosbag2 folder, a .mcap, .db3, .bag, .csv, .tsv, .bin, .ulg, .ulog or .tlog file",
         ),
     ],
 )

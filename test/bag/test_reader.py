@@ -282,7 +282,7 @@ LOST = (
             lambda p: (p / "bag.db3").write_bytes(b"x" * 999) and p / "bag.db3",
             "is not a readable rosbag2 database",
         ),
-        (lambda p: p, "is a folder without .mcap, .db3 or .csv files"),
+        (lambda p: p, "is a folder without .mcap, .db3, .csv or .tsv files"),
         (
             lambda p: (
                 (p / "bag.bag").write_bytes(b"#ROSBAG V1.2\n" * 9) and p / "bag.bag"

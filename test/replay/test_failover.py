@@ -79,9 +79,20 @@ def test_failover_works_with_two_or_three_imus_of_three_channels():
 
 
 def test_an_imu_keeps_its_number_where_the_log_lacks_another():
-    """IMU 1 and 3: the second unit of the recording is IMU 3 of the autopilot."""
+    """IMU 1, 3 and 4: the second unit of the recording is IMU 3 of the autopilot."""
+    names = ["imu_1", "imu_3", "imu_4"]
+    changes = {"imus.topics": [f"/{name}" for name in names], "imus.names": names}
+    rates = recorded()
+    rates[1500:2000, 3:6] += (0.7, -0.9, 0.8)
+    assert orders(rates, CONFIG.replaced(changes))[0][0] == "IMU 3 out of use"
+
+
+def test_of_two_imus_a_frozen_one_stays_in_use():
+    """Nothing checks the other one meanwhile, which may be wrong as well."""
     changes = {"imus.topics": ["/imu_1", "/imu_3"], "imus.mounts": []}
     config = CONFIG.replaced({**changes, "imus.names": ["imu_1", "imu_3"]})
     rates = recorded()[:, :6]
     rates[1500:2000, 3:6] = rates[1499, 3:6]
-    assert orders(rates, config)[0][0] == "IMU 3 out of use"
+    replay = FailoverReplay(config.channel_names, config.sample_rate)
+    Walk(Pipeline(config), [replay]).take(Block(INTERVAL * np.arange(3000), rates))
+    assert "no IMU out of use" in replay.text()
