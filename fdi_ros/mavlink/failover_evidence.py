@@ -520,7 +520,8 @@ class Evidence:
     def _note_proven(self, unit: int, units: Sequence[int], now: int) -> None:
         """Note the axes on which an IMU is known to measure.
 
-        One that is found bad on a further axis may be dead: this counts anew on all.
+        One that is found bad on a further axis may be dead: this counts anew on all. What is
+        unknown, such as after a gap, is not bad.
         """
         track = self._tracks[unit]
         pairs = {k: self._pairs[unit, k] for k in units if k != unit}
@@ -528,7 +529,8 @@ class Evidence:
         off = {
             axis
             for axis in range(3)
-            if not any(pair.apart[axis] < self._min_size for pair in pairs.values())
+            if pairs
+            and all(pair.apart[axis] >= self._min_size for pair in pairs.values())
         }
         bad = named | {(axis, False) for axis in off}
         if not bad <= track.bad:

@@ -191,6 +191,27 @@ def test_an_error_at_rest_counts_once_the_vehicle_turns() -> None:
     assert watched.blamed(0.3) == {1}
 
 
+@pytest.mark.parametrize("gap", [False, True])
+def test_what_was_unknown_was_not_off(gap: bool) -> None:
+    """In a hover with small moves, after a start in flight, or a gap of the link beside a bad IMU."""
+    watched = watch()
+    watched.rate = lambda t: 0.02 * np.sin(t * np.array([3.0, 2.3, 1.9]))
+    if gap:
+        watched.gyros[0] = biased(0.3)
+        watched.states[0] = FAULTY
+        assert watched.blamed(1.0) == {0}
+        watched.out = [0]
+        watched.sent += NS
+    else:
+        watched.evidence = Evidence(3, STEP, min_size=0.03)
+    watched.run(4.0)
+    # Its name is older than its error, so it has to be outvoted.
+    watched.states[5] = FAULTY
+    assert 1 not in watched.blamed(1.0)
+    watched.gyros[1] = biased(0.3, axis=2)
+    assert watched.blamed(1.0) - {0} == {1}
+
+
 def test_two_that_are_dead_from_the_start_do_not_outvote_the_third() -> None:
     """All agree at rest. Only a turn shows that two gyros measure."""
     watched = watch()
