@@ -310,6 +310,15 @@ class RawComparison:
         x, y, z = np.abs(self._rates(unit, periods=2)).max(axis=0).tolist()
         return x, y, z
 
+    def noise(self, unit: int, other: int) -> list[float]:
+        """Return the standard deviation of noise in the mean difference of two IMUs, rad/s.
+
+        By axis. Of white noise that explains the steps of the differences. NaN: none are known.
+        """
+        rows = self._pairs[min(unit, other), max(unit, other)]
+        root = math.sqrt(self._averaged)
+        return [rough / root for rough in rows.roughness(len(rows))]
+
     def is_stuck(self, unit: int) -> bool:
         """Return whether an IMU has repeated one value while another one moved."""
         return self._stuck[unit]
