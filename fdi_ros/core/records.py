@@ -188,6 +188,7 @@ class Estimate:
     excess: Real
     bias: Channels  # in addition to the bias from the start, rad/s
     bias_std: Channels  # standard deviation of `bias`, rad/s
+    far_bias: Channels  # bias that no healthy sensor has, rad/s, or 0
     # channels whose `bias` may be errors of others: a fault of each alone did not explain
     # the values
     unclear: Mask

@@ -102,6 +102,7 @@ from fdi_ros.estimator.shared_noise import (
     update_shared_level,
 )
 from fdi_ros.estimator.snapshots import inflate_delays, keep_snapshot, pass_hole
+from fdi_ros.estimator.start_bias import doubt_start
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import FalseAlarmRate, NoiseModel
 from fdi_ros.model.samples import MAX_RATE
@@ -239,6 +240,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
         update_excess(params, kf)
     if kf.all_blocks % BLOCKS_PER_COARSE == 0:
         look_for_slow_faults(params, state)
+        doubt_start(params, kf)
 
 
 @compiled
@@ -364,10 +366,13 @@ def fill_verdict(
         sample.estimate.bias[i] = kf.states.x[i]
         sample.estimate.spikes[i] = kf.spikes[i]
         sample.estimate.bias_std[i] = math.sqrt(kf.states.p[i, i])
+        sample.estimate.far_bias[i] = kf.far_bias[i]
         for j in range(n):
             # Until the faulty channels are named, each one may have the error that the
             # hypotheses give it.
             doubt = case.inference.error_products[i, j] if unsure else 0.0
+            # So may all biases, if one that the states have learned is a fault.
+            doubt += kf.bias_error[i] * kf.bias_error[j]
             sample.estimate.covariance[i, j] = kf.at.covariance[i, j] + doubt
         if (kf.mask & ~kf.judged) >> i & 1:
             # The channels that it differed from are missing.
@@ -497,6 +502,9 @@ class Sequential(Detector):
         Probability that the named set holds the truth, above 0.5 and below 1.
     bias_walk
         Random walk of the bias of each channel, scalar or (n,), rad/s/sqrt(s).
+    turn_on_std
+        Standard deviation of the bias of a healthy sensor from one start to the next, rad/s;
+        0: not known. A bias far beyond it widens the covariance.
     bias_move
         By which a healthy bias may move within seconds, standard deviation, rad/s: a
         fault has to be beyond that, unless it is sudden.
@@ -535,6 +543,7 @@ class Sequential(Detector):
         sample_rate: float | None = None,
         confidence: float = 0.999,
         bias_walk: float | Sequence[float] = 5e-5,
+        turn_on_std: float = 0.0,
         bias_move: float = 0.0,
         rectified: float = 0.0,
         largest_move: float = 0.0,
@@ -560,6 +569,7 @@ class Sequential(Detector):
                 "sample_rate": self.sample_rate,
                 "confidence": confidence,
                 "bias_walk": float(walk.max()),
+                "turn_on_std": turn_on_std,
                 "bias_move": bias_move,
                 "rectified": rectified,
                 "largest_move": largest_move,
@@ -597,6 +607,7 @@ class Sequential(Detector):
         params["louder"] = louder
         params["rest_std"] = REST_STD
         params["g_sensitivity"] = g_sensitivity_std
+        params["turn_on"] = turn_on_std
         params["bias_move"] = bias_move
         params["rectified"] = rectified
         params["largest_move"] = largest_move

@@ -117,6 +117,7 @@ class Constants:
     rest_std: Real  # of the rate at rest, rad/s
     # of a bias, standard deviation, (rad/s)/(m/s^2), or 0
     g_sensitivity: Real
+    turn_on: Real  # bias from one start to the next, standard deviation, rad/s, or 0
     bias_move: Real  # of a healthy bias in flight, standard deviation, rad/s
     rectified: Real  # as of `fdi_ros.model.quantity.Quantity`
     largest_move: Real  # of all healthy biases together within half a minute, rad/s
@@ -185,6 +186,8 @@ class Estimator:
     clean_rate: Vector  # of that, rad/s
     rate: Vector  # of the last sample, rad/s
     start_bias: Channels  # bias that the values do not contain, rad/s
+    far_bias: Channels  # bias far beyond its prior, rad/s, or 0
+    bias_error: Channels  # of all biases if that one is a fault, rad/s
     corrected: Channels  # values less their estimated errors, rad/s
     # the same, with the rate of the others in place of a spike, rad/s
     imputed: Channels

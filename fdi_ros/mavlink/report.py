@@ -199,11 +199,13 @@ NOTHING_SEEN_FOR = 2 * NS
 GRAVE = 0.03  #: ArduCopter flies with a smaller error of a gyro, rad/s.
 #: Raw rates of healthy gyros, in whole mrad/s and averaged, differ by less, rad/s.
 ROUNDED = 0.005
+FAR = "FAR"  #: State of an accelerometer with a bias that no healthy one has.
 FROZEN = "FROZEN"  #: State of an undeclared channel whose unit repeats old values.
 _STATES = {
     "FAULTY": (CRITICAL, "faulty"),
     "AMBIGUOUS": (WARNING, "one of them faulty"),
     "STALE": (WARNING, "no data"),
+    FAR: (WARNING, "biased"),
     FROZEN: (WARNING, "frozen"),
 }  # severity and words by state
 _QUIET = ("OK", "AMBIGUOUS")  #: Not announced beside failover.
@@ -292,8 +294,11 @@ class Announcer:
                 self._note(line.name, (state if state in _STATES else "OK", group), now)
             elif line.name in self._forces:
                 # Sets, and what a whole unit lacks, stay in the diagnostics.
-                self._errors[line.name] = abs(line.number("estimated error (m/s^2)"))
-                self._note(line.name, (state if state == "FAULTY" else "OK", ""), now)
+                bias = abs(line.number("implausible bias (m/s^2)"))
+                error = abs(line.number("estimated error (m/s^2)"))
+                told = "FAULTY" if state == "FAULTY" else FAR if bias > 0.0 else "OK"
+                self._errors[line.name] = bias if told == FAR else error
+                self._note(line.name, (told, ""), now)
 
     def _note(self, name: str, found: tuple[str, str], now: int) -> None:
         if found != self._now[name]:
@@ -366,8 +371,11 @@ class Announcer:
             return WARNING, self._set_text(group)
         severity, words = _STATES.get(state, (INFO, "agrees again"))
         if names[0] in self._forces:
-            if state == "FAULTY" and self._errors[names[0]] > 0.0:
+            if state in ("FAULTY", FAR) and self._errors[names[0]] > 0.0:
                 words = f"off by {self._errors[names[0]]:.1f} m/s^2"
+            if sum(now[0] == FAR for now in self._now.values()) > 1:
+                # Two that differ: either may be the one.
+                words = words.replace("m/s^2", "m/s^2?") if state == FAR else words
             return max(severity, WARNING), _fit(self._forces[names[0]], words)
         if state == "FAULTY" and max(map(self._errors.__getitem__, names)) < GRAVE:
             severity = WARNING

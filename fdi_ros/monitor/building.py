@@ -156,6 +156,7 @@ def _build(
     turn_on_std = config.bias.turn_on_std
     errors = {
         "bias_walk": config.noise.bias_walk,
+        "turn_on_std": turn_on_std,
         "bias_move": quantity.bias_move * turn_on_std,
         "rectified": quantity.rectified if turn_on_std > 0.0 else 0.0,
         # With a turn-on error of 0 the biases are known, and stay so.

@@ -275,8 +275,8 @@ def _channel_worse(channel: ChannelStatus, status: Status) -> list[str]:
         words.append(f"bias has drifted by {_figure(channel.drift)} {unit}, {limit}")
     if status.has_implausible_start_bias(channel):
         words.append(
-            f"bias of {_figure(channel.start_bias)} rad/s at the start, far above bias.turn_on_std"
-            f" ({bias.turn_on_std:g}): perhaps a fault from before the start"
+            f"bias of {_figure(channel.start_bias)} {unit} at the start, far above {section}.turn_on_std"
+            f" ({status.turn_on_std(channel):g}): perhaps a fault from before the start"
         )
     return words
 
@@ -292,7 +292,9 @@ def _whole_message(
     healthy = {
         channel.name
         for channel in status.channels
-        if channel.state == ChannelState.OK and channel.name not in doubtful
+        if channel.state == ChannelState.OK
+        and channel.name not in doubtful
+        and not status.has_implausible_start_bias(channel)
     }
     about = [channel.name for channel in status.channels if channel.name in worse]
     alive = sum(not channel.is_left_out for channel in status.channels)
@@ -468,10 +470,17 @@ def _channel_message(
         *map(_format_frozen, _frozen_units(channel, status)),
         *worse.get(channel.name, ()),
     ]
+    is_far = any(
+        one.unit == channel.unit and status.has_implausible_start_bias(one)
+        for one in status.channels
+    )
     unusual = [
         str(error)
         for error in status.errors
-        if error.owner == channel.name and error.is_unusual
+        if error.owner == channel.name
+        and error.is_unusual
+        # One bias that is a fault makes those of the others look large.
+        and not (is_far and error.kind == "bias")
     ]
     level = max(
         _LEVELS.get(channel.state, Level.WARN), Level.WARN if wrong else Level.OK
@@ -560,6 +569,12 @@ def _channel_values(
         (f"estimated error ({unit})", _figure(channel.error)),
         (f"bias ({unit})", _figure(status.bias[k]) if k < len(status.bias) else ""),
         (f"of that followed in flight ({unit})", _figure(channel.drift)),
+        (
+            f"implausible bias ({unit})",
+            _figure(channel.start_bias)
+            if status.has_implausible_start_bias(channel)
+            else "none",
+        ),
         (f"bias known to ({unit})", _figure(channel.bias_std)),
         (
             "scale and misalignment (1)",

@@ -32,7 +32,7 @@ from fdi_ros.errors import GeometryError
 from fdi_ros.estimator.error_states import ERROR_KINDS, places_of
 from fdi_ros.model.geometry import MIN_CHANNELS, Geometry, lone_pairs, one_of_words
 from fdi_ros.model.noise import assumption_words
-from fdi_ros.model.quantity import RATE, Quantity
+from fdi_ros.model.quantity import FORCE, RATE, Quantity
 from fdi_ros.model.samples import Array, Mask
 from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
 from fdi_ros.system.text import listed, plus_minus
@@ -88,7 +88,8 @@ class ChannelStatus:
     #: Share of the recent samples in which the channel gave a finite value.
     delivers: float = 1.0
     drift: float = 0.0  #: How far its bias has been followed in flight from that at the start, in ``unit``.
-    #: Bias learned at the start, beyond ``bias.fixed``, in ``unit``.
+    #: Bias learned at the start, beyond ``bias.fixed``, in ``unit``. Where no start at rest shows it
+    #: alone, only one that is far beyond ``turn_on_std``.
     start_bias: float = 0.0
     #: Standard deviation of the bias without the part common to all channels, in
     #: ``unit``, NaN: not estimated.
@@ -260,14 +261,16 @@ class Status:
         )
         return value if abs(value) > LEAST_SCALE + CERTAIN * std else 0.0
 
+    def turn_on_std(self, channel: ChannelStatus) -> float:
+        """Return the standard deviation of a bias from one start to the next, in the channel's unit."""
+        is_force = channel.unit == FORCE.unit
+        settings = self.config.accelerometers if is_force else self.config.bias
+        return settings.turn_on_std
+
     def has_implausible_start_bias(self, channel: ChannelStatus) -> bool:
-        """Whether a channel is used that began with a bias no healthy gyro is expected to have."""
-        return (
-            not channel.is_left_out
-            and abs(channel.start_bias)
-            > MAX_START_BIAS * self.config.bias.turn_on_std
-            > 0
-        )
+        """Whether a channel is used that began with a bias no healthy sensor is expected to have."""
+        limit = MAX_START_BIAS * self.turn_on_std(channel)
+        return not channel.is_left_out and abs(channel.start_bias) > limit > 0.0
 
 
 def status_of(
@@ -378,7 +381,11 @@ def _channel(
         delivers=(1.0 - float(health["gone"][i])) * (1.0 - float(health["absent"][i])),
         drift=natural * float(core["sample"]["estimate"]["bias"][i]),
         start_bias=natural
-        * float(core["bias"]["value"][i] - core["bias"]["centre"][i]),
+        * float(
+            core["bias"]["value"][i]
+            - core["bias"]["centre"][i]
+            + core["sample"]["estimate"]["far_bias"][i]
+        ),
         bias_std=natural * float(core["remaining"][i]),
         noise=float(core["now"]["verdict"]["noise"][i]),
         noisy=is_in(i, int(core["now"]["noisy"])),

@@ -118,8 +118,8 @@ def unjudged_words(judgement: Judgement) -> str:
         return f"only {percent(share)} of {scores.samples} samples were judged"
     if bias.far:
         return (
-            f"the bias of {listed(bias.far)} was far larger than bias.turn_on_std from the"
-            " start: perhaps a fault before the recording"
+            f"the bias of {listed(bias.far)} is far larger than turn_on_std allows: perhaps a"
+            " fault from before the recording"
         )
     return ""
 
@@ -128,9 +128,7 @@ def _to_judge(judgement: Judgement) -> str:
     """Return what to do about a recording that was not judged as a whole."""
     bias = judgement.monitor.bias
     if bias.far:
-        return (
-            f"check {listed(bias.far)}, or set bias.turn_on_std if such a bias is usual"
-        )
+        return f"check {listed(bias.far)}, or set turn_on_std if such a bias is usual"
     if bias.state == "learning":
         return "record for longer, with some seconds of rest at the start"
     frozen = [

@@ -86,6 +86,21 @@ def test_an_accelerometer_is_named_with_its_size_and_stays_a_warning(apart) -> N
     assert len("FDI: accelerometer z of IMU 4 off by 156.9 m/s^2") <= TEXT_LENGTH
 
 
+def test_an_accelerometer_that_is_wrong_from_the_start_is_told() -> None:
+    def biased(name: str, size: str) -> StatusLine:
+        values = (("state", "OK"), ("implausible bias (m/s^2)", size))
+        return StatusLine(Level.WARN, name, "", values=values)
+
+    ground = Ground()
+    assert ground.hear(biased("imu_1.accel_x", "none")) == []
+    text = "FDI: accelerometer x of IMU 1 off by 5.0 m/s^2"
+    assert ground.hear(biased("imu_1.accel_x", "-5.02")) == [(WARNING, text)]
+    # Of two that differ, either may be the one.
+    text = "FDI: accelerometer x of IMU 2 off by 5.0 m/s^2?"
+    assert ground.hear(biased("imu_2.accel_x", "5.0")) == [(WARNING, text)]
+    assert len(text) <= TEXT_LENGTH
+
+
 def test_declarations_are_told_and_suspicions_are_not() -> None:
     ground = Ground()
     assert ground.hear(report("imu_2.y", "SUSPECT")) == []

@@ -1,0 +1,93 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A bias that no healthy sensor begins with.
+
+A sensor that is faulty from the first sample on looks like one with a large bias, and the states
+learn it. Their priors tell how unlikely it is: with the prior variance V of a bias, and its state x
+of variance P, x is normal with variance V - P. Where one bias is beyond that, the alternative is
+that it has no prior. The states then change by P[:, k] x_k / (V - P[k, k]) (Sherman and Morrison):
+this much of the others' biases, and of the fused rate, is in doubt.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fdi_ros.compiling.compiled import compiled
+from fdi_ros.estimator.estimator import Constants, Estimator
+
+FAR = 4.0
+"""Standard deviations from which a bias is far beyond its prior: one healthy start in 16 000."""
+DOUBTED = 3.0
+"""The same from which the covariance allows for it, in full from `FAR` on."""
+LEAST_SHOWN = 0.05
+"""Least share of its prior variance that must be known of a bias."""
+
+
+@compiled
+def doubt_start(params: Constants, kf: Estimator) -> None:
+    """Find the biases that are far beyond their priors, and the error of all if the worst has none.
+
+    Written to ``kf.far_bias``, rad/s, zero where a bias is plausible, and to ``kf.bias_error``.
+    """
+    n = params.sensors.n
+    states = kf.states
+    for i in range(n):
+        kf.far_bias[i] = kf.bias_error[i] = 0.0
+    if params.turn_on == 0.0:
+        return
+    worst = -1
+    largest = DOUBTED * DOUBTED
+    for i in range(n):
+        prior = prior_variance(params, kf.seconds, i)
+        shown = prior - states.p[i, i]
+        if shown > LEAST_SHOWN * prior and states.x[i] ** 2 > largest * shown:
+            largest = states.x[i] ** 2 / shown
+            worst = i
+    if worst < 0:
+        return
+    shown = prior_variance(params, kf.seconds, worst) - states.p[worst, worst]
+    range_of_weight = FAR * FAR - DOUBTED * DOUBTED
+    weight = math.sqrt(min((largest - DOUBTED * DOUBTED) / range_of_weight, 1.0))
+    for i in range(n):
+        error = states.p[i, worst] * states.x[worst] / shown
+        kf.bias_error[i] = weight * error
+        if largest > FAR * FAR:
+            kf.far_bias[i] = far_bias(params, kf, i, worst)
+
+
+@compiled
+def far_bias(params: Constants, kf: Estimator, i: int, worst: int) -> float:
+    """Return bias i if it had no prior, rad/s, or 0 if it is plausible beside the worst one."""
+    states = kf.states
+    prior = prior_variance(params, kf.seconds, i)
+    known = prior - states.p[i, i]
+    if known <= LEAST_SHOWN * prior:
+        return 0.0
+    value = states.x[i]
+    variance = known
+    if i != worst:
+        shown = prior_variance(params, kf.seconds, worst) - states.p[worst, worst]
+        gain = states.p[i, worst] / shown
+        left = known - gain * states.p[i, worst]
+        # Else only the difference of the two is known: either may be the one.
+        if left > LEAST_SHOWN * prior:
+            value += gain * states.x[worst]
+            variance = left
+    is_far = value * value > FAR * FAR * variance
+    return value * prior / variance if is_far else 0.0
+
+
+@compiled
+def prior_variance(params: Constants, seconds: float, i: int) -> float:
+    """Return the variance of a bias after some time without any measurement, (rad/s)^2."""
+    layout = params.layout
+    variance = params.turn_on**2 + layout.walk[i] ** 2 * seconds
+    for r in range(layout.n, layout.count):
+        if layout.feeds[r] == i:
+            # Integral of a Gauss-Markov process.
+            spans = seconds / layout.memory[r]
+            drift = layout.prior[r] * layout.memory[r]
+            variance += 2.0 * drift**2 * (spans - 1.0 + math.exp(-spans))
+    return variance

@@ -1,0 +1,121 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A sensor that is wrong from the first sample on looks like one with a large bias."""
+
+import numpy as np
+import pytest
+
+from fdi_ros.config.config import Config
+from fdi_ros.core.states import ChannelState
+from fdi_ros.model.samples import Block
+from fdi_ros.monitor.diagnostics import describe
+from fdi_ros.monitor.pipeline import Output, Pipeline
+from fdi_ros.monitor.soundness import Word, live_word
+from fdi_ros.monitor.status import Status
+
+INTERVAL = 0.01
+SECONDS = 10.0
+GRAVITY = 9.81
+
+
+def fly(
+    units: int, errors: dict[str, float], begin: float = 0.0, seed: int = 1
+) -> tuple[Status, Output, np.ndarray]:
+    """Return status and output after a gentle flight with constant errors, and the true force."""
+    t = np.arange(0.0, SECONDS, INTERVAL)
+    random = np.random.default_rng(seed)
+    phase = random.uniform(0.0, 6.0, 3)
+    rate = [0.4, 0.3, 0.2] * np.sin(np.outer(t, [0.9, 1.3, 0.5]) + phase)
+    force = [1.5, 1.0, 0.8] * np.sin(np.outer(t, [1.1, 0.7, 1.7]) + phase)
+    force[:, 2] += GRAVITY
+    config = Config.from_parameters(
+        {
+            "input": "imus",
+            "sample_rate": 1.0 / INTERVAL,
+            "imus.topics": [f"/imu_{k + 1}" for k in range(units)],
+        }
+    )
+    pipeline = Pipeline(config)
+    gyros = np.tile(rate, (1, units)) + random.normal(0.0, 0.002, (len(t), 3 * units))
+    healthy = random.normal(0.0, 0.1, 3 * units)
+    forces = np.tile(force, (1, units)) + healthy
+    forces += random.normal(0.0, 0.05, forces.shape)
+    for name, error in errors.items():
+        unit, channel = name.split(".")
+        column = 3 * int(unit[-1]) - 3 + "xyz".index(channel[-1])
+        half = forces if channel.startswith("accel") else gyros
+        half[t >= begin, column] += error
+    stamp = 10**9 + (1e9 * t).astype(np.int64)
+    output = pipeline.process(Block(stamp, gyros, acceleration=Block(stamp, forces)))
+    return pipeline.status(), output, force
+
+
+def far(status: Status) -> list[str]:
+    return [
+        one.name for one in status.channels if status.has_implausible_start_bias(one)
+    ]
+
+
+def normalised_error(output: Output, force: np.ndarray) -> float:
+    """Return the mean of NEES/3 of the fused force after 2 s."""
+    fused = output.acceleration
+    assert fused is not None
+    rows = slice(round(2.0 / INTERVAL), None)
+    error = (fused.rate - force)[rows]
+    solved = np.linalg.solve(fused.covariance[rows], error[:, :, None])[:, :, 0]
+    return float(np.mean(error * solved))
+
+
+@pytest.mark.parametrize("size", [-2.7, 5.0, 7.5])
+def test_an_accelerometer_that_is_wrong_from_the_start_is_doubted(size: float) -> None:
+    status, output, force = fly(3, {"imu_2.accel_y": size})
+    assert far(status) == ["imu_2.accel_y"]
+    channel = next(one for one in status.channels if one.name == "imu_2.accel_y")
+    assert channel.start_bias == pytest.approx(size, abs=0.5)
+    assert live_word(status, ()) is Word.CANNOT_TELL
+    assert 0.05 < normalised_error(output, force) < 1.0
+    lines = {line.name: line.message for line in describe(status, "")}
+    assert "8 of 9 accelerometers healthy" in lines["monitor"]
+    assert (
+        "m/s^2 at the start, far above accelerometers.turn_on_std (0.5)"
+        in (lines["imu_2.accel_y"])
+    )
+    assert "times its prior" not in lines["imu_1.accel_y"]
+
+
+def test_of_two_units_either_may_be_the_wrong_one() -> None:
+    status, output, force = fly(2, {"imu_1.accel_z": 5.0})
+    assert far(status) == ["imu_1.accel_z", "imu_2.accel_z"]
+    assert 0.05 < normalised_error(output, force) < 1.0
+
+
+def test_two_that_are_wrong_are_both_told() -> None:
+    status, *_ = fly(4, {"imu_1.accel_z": 5.0, "imu_3.accel_x": -4.0})
+    assert far(status) == ["imu_1.accel_z", "imu_3.accel_x"]
+
+
+@pytest.mark.parametrize("seed", range(1, 6))
+@pytest.mark.parametrize("units", [2, 3])
+def test_a_usual_bias_is_not_doubted(units: int, seed: int) -> None:
+    """1.2 m/s^2 is 2.4 standard deviations: the covariance has room for it."""
+    status, output, force = fly(units, {"imu_1.accel_x": 1.2}, seed=seed)
+    assert not far(status)
+    assert live_word(status, ()) is Word.HEALTHY
+    assert normalised_error(output, force) < 2.0
+
+
+def test_one_that_goes_wrong_later_is_declared() -> None:
+    status, *_ = fly(3, {"imu_2.accel_y": 5.0}, begin=5.0)
+    assert not far(status)
+    states = {one.name: one.state for one in status.channels}
+    assert states["imu_2.accel_y"] is ChannelState.FAULTY
+
+
+@pytest.mark.parametrize("size", [0.15, -0.3])
+def test_a_gyro_that_is_wrong_from_the_start_is_no_healthy_one(size: float) -> None:
+    """Its biases are not learned at rest, but as given, so that the states take the error."""
+    status, *_ = fly(3, {"imu_2.y": size})
+    states = {one.name: one.state for one in status.channels}
+    assert far(status) == ["imu_2.y"] or states["imu_2.y"] is ChannelState.FAULTY
+    assert live_word(status, ()) in (Word.CANNOT_TELL, Word.FAULTY)
