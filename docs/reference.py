@@ -49,6 +49,7 @@ WHEN = {
     "noise.nonlinearity_std": "The data sheet states more, or `fdi setup` measures more.",
     "noise.bound": "With the detector `guaranteed`: the limit from the data sheet.",
     "noise.bias_walk": "As `fdi calibrate` measures it. Larger: slow drifts are no fault; smaller: they are found.",
+    "noise.shared_scale_std": "After `fdi setup`, which writes 0.005: a turn by a known angle shows less.",
     "noise.g_sensitivity_std": "The data sheet states another one: 1 deg/s/g is 0.0018.",
     "noise.acceleration_window": "Strong vibration: longer, so that it is not taken for angular acceleration.",
     "bias.fixed": "`fdi calibrate` writes it.",

@@ -296,6 +296,13 @@ class NoiseConfig:
         0.0,
         1.0,
     )
+    shared_scale_std: float = setting(
+        0.0,
+        "standard deviation of the scale errors that all gyros have in common, per axis",
+        "",
+        0.0,
+        0.1,
+    )
     g_sensitivity_std: float = setting(
         1.8e-4,
         "standard deviation of the change of a gyro's bias with the specific force, beside accelerometers; 0: none",

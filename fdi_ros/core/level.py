@@ -128,7 +128,7 @@ def cover_rivals(core: Core) -> None:
     now = core.now
     decision = core.decision
     n = core.settings.n
-    fill_parity(now.parity, core.settings.sensors, now.fused, now.uncertainty)
+    fill_parity(now.parity, core.settings.sensors, now.fused, now.own)
     chi = chi_of(now.parity, n, now.fused, now.corrected)
     level = core.last.level
     for a in range(3):
@@ -191,7 +191,7 @@ def cover(core: Core, out: int, chi: float) -> None:
     now = core.now
     information = core.now.parity.information
     mask = now.fused | out
-    fill_parity(now.parity, core.settings.sensors, mask, now.uncertainty)
+    fill_parity(now.parity, core.settings.sensors, mask, now.own)
     for i in range(n):
         now.rival[i] = dot_in(information[i], now.corrected, n, mask)
     # Each channel left out reduces the degrees of freedom of chi by one.
@@ -216,7 +216,7 @@ def cover_single(core: Core, i: int, base: float) -> None:
     information = core.now.parity.information[i, i]
     u = core.now.rival[i]
     # With less, no residual shows the channel.
-    if information * core.now.uncertainty[i] > APART:
+    if information * core.now.own[i] > APART:
         log_odds = base + 0.5 * u * u / information
         cover_rival(
             core,

@@ -183,6 +183,7 @@ class Estimate:
     corrected: Channels  # values less their estimated errors, rad/s
     variance: Channels  # of the present noise, (rad/s)^2
     covariance: Square  # of the estimated errors, (rad/s)^2
+    common: Channels  # part of its diagonal that no weights reduce, (rad/s)^2
     # largest ratio of a residual's variance to the expected one, at least 1; valid only
     # after `wants_excess`
     excess: Real
@@ -664,6 +665,7 @@ class Current:
     moved: Channels  # change of each channel since another one repeats its value, rad/s
     variance: Channels  # of noise and other errors of single samples, (rad/s)^2
     uncertainty: Channels  # `variance` plus that of the estimated errors, (rad/s)^2
+    own: Channels  # the same without what all channels share: what weights reduce
     parity: Parity
     rival: Channels  # A z of channels fused and left out, s/rad
     gain: Annotated[NDArray[np.float64], "f8", (3, MAX_CHANNELS)]  # of the fused rate

@@ -367,6 +367,10 @@ def fill_verdict(
         sample.estimate.spikes[i] = kf.spikes[i]
         sample.estimate.bias_std[i] = math.sqrt(kf.states.p[i, i])
         sample.estimate.far_bias[i] = kf.far_bias[i]
+        sample.estimate.common[i] = kf.bias_error[i] * kf.bias_error[i]
+        for a in range(3):
+            shared = params.layout.shared_scale * kf.signal_rate[a]
+            sample.estimate.common[i] += (shared * params.sensors.axes[i, a]) ** 2
         for j in range(n):
             # Until the faulty channels are named, each one may have the error that the
             # hypotheses give it.
@@ -511,6 +515,9 @@ class Sequential(Detector):
     largest_move
         By which all healthy biases may move together within half a minute, rad/s; 0: they
         never do.
+    shared_scale_std
+        Standard deviation, per axis of the body, of the scale errors that all channels have in
+        common: no comparison shows these.
     g_sensitivity_std
         Standard deviation of the change of a bias with the specific force, where the
         samples have one, (rad/s)/(m/s^2).
@@ -547,6 +554,7 @@ class Sequential(Detector):
         bias_move: float = 0.0,
         rectified: float = 0.0,
         largest_move: float = 0.0,
+        shared_scale_std: float = 0.0,
         g_sensitivity_std: float = 0.0,
         delay_std: float = 0.001,
         gain_is_fault: bool = False,
@@ -573,6 +581,7 @@ class Sequential(Detector):
                 "bias_move": bias_move,
                 "rectified": rectified,
                 "largest_move": largest_move,
+                "shared_scale_std": shared_scale_std,
                 "g_sensitivity_std": g_sensitivity_std,
                 "delay_std": delay_std,
                 "gain_is_fault": gain_is_fault,
@@ -603,6 +612,7 @@ class Sequential(Detector):
         params["nonlinearity"][:n] = np.maximum(
             noise.nonlinearity_std, LEAST_NONLINEARITY
         )
+        params["layout"]["shared_scale"] = shared_scale_std
         params["gain_is_fault"] = gain_is_fault
         params["louder"] = louder
         params["rest_std"] = REST_STD

@@ -23,6 +23,7 @@ from fdi_ros.compiling.compiled import (
     MAX_CHANNELS,
     MAX_UNITS,
     Axes,
+    Real,
     Square,
     Whole,
     compiled,
@@ -98,6 +99,8 @@ class Layout:
     place: Entries  # state of each signal of a channel, or -1
     prior: States  # standard deviation, in the unit of each
     walk: States  # per sqrt(s)
+    # standard deviation, per axis of the body, of the scale errors common to all channels
+    shared_scale: Real
     memory: States  # time constant, s, or 0 if infinite
     feeds: Places  # state of which this one is the rate of change, or -1
     delays: Annotated[
@@ -196,6 +199,21 @@ def begin_states(layout: Layout, states: ErrorStates, bias_std: Array) -> None:
             states.p[r, c] = 0.0
         std = bias_std[r] if r < layout.n else layout.prior[r]
         states.p[r, r] = std * std
+    add_shared_scale(layout, states)
+
+
+@compiled
+def add_shared_scale(layout: Layout, states: ErrorStates) -> None:
+    """Add the covariance of scale errors, one for each axis of the body, that all channels share."""
+    variance = layout.shared_scale * layout.shared_scale
+    for signal in range(SIGNALS):
+        axis = layout.by[signal] - RATE_X
+        if not 0 <= axis < 3 or variance == 0.0:
+            continue
+        for i in range(layout.n):
+            for j in range(layout.n):
+                shared = variance * layout.axes[i, axis] * layout.axes[j, axis]
+                states.p[layout.place[i, signal], layout.place[j, signal]] += shared
 
 
 @compiled

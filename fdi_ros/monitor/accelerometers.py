@@ -95,6 +95,7 @@ def accelerometer_config(config: Config, units: Sequence[int]) -> Config:
         "noise.bias_walk": scaled(own.bias_walk),
         # Asymmetry under gravity, which lasts, looks like a bias.
         "noise.nonlinearity_std": (0.0,),
+        "noise.shared_scale_std": 0.0,
         "noise.g_sensitivity_std": 0.0,
         "noise.bound": (),
         "bias.turn_on_std": own.turn_on_std / FORCE.natural,

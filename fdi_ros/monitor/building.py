@@ -161,6 +161,7 @@ def _build(
         "rectified": quantity.rectified if turn_on_std > 0.0 else 0.0,
         # With a turn-on error of 0 the biases are known, and stay so.
         "largest_move": quantity.largest_move if turn_on_std > 0.0 else 0.0,
+        "shared_scale_std": config.noise.shared_scale_std,
         "g_sensitivity_std": config.noise.g_sensitivity_std,
         "delay_std": delay_std,
         "gain_is_fault": quantity.gain_is_fault,

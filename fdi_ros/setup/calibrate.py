@@ -76,6 +76,9 @@ LEAST_DURATION, LEAST_SAMPLES, LONGEST_STEP = (
     100,
     1.0,
 )
+#: Scale error of all gyros of a type, which their differences do not show: data sheets of MEMS
+#: gyros state 0.5 to 1.5 %, and calibrations at the works leave less.
+SHARED_SCALE = 0.005
 #: share of its samples that a channel must give
 LEAST_USABLE = 0.3
 #: longest fault, as a share of the recording, for which the others decide
@@ -238,6 +241,9 @@ class _Beside:
     ) -> None:
         self.positions = find_positions(block, config, gyros)
         self.settings = _settings(config, active, step, gyros)
+        if not trusted:
+            common = max(config.noise.shared_scale_std, SHARED_SCALE)
+            self.settings["noise.shared_scale_std"] = common
         self.settings |= position_settings(self.positions, config)
         self.config = config.replaced(self.settings)
         self.ready: Prepared | None = None

@@ -268,3 +268,51 @@ def test_a_turn_that_changes_in_a_hole_leaves_the_covariance_as_it_was(offset):
         stds.append(np.sqrt(output.covariance[-60:, 2, 2]))
     assert stds[1].max() < 1.3 * stds[0].max()
     assert stds[1].min() > 0.7 * stds[0].min()
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.01])
+def test_scale_errors_that_all_gyros_share_are_in_the_covariance(shared):
+    """No comparison shows them. Calibrated to 5e-5 of each other, they spin at 10 rad/s."""
+    errors = []
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        time = np.arange(round(12.0 * RATE)) / RATE
+        rate = swung(time) / 2.0
+        rate[:, 2] += 10.0 * np.clip((time - 6.0) / 2.0, 0.0, 1.0)
+        scale = 1.0 + random.normal(0.0, 0.01, 3)
+        z = np.tile(rate * scale, (1, 3))
+        z += random.normal(0.0, SIGMA, z.shape)
+        given = {
+            "detector__name": "sequential",
+            "noise__scale_std": 5e-5,
+            "noise__shared_scale_std": shared,
+        }
+        output = Pipeline(parallel(3, **given)).process(
+            Block(START + np.round(1e9 * time).astype(np.int64), z)
+        )
+        assert set(output.state[-1].tolist()) == {ChannelState.OK}
+        error = output.rate[-1] - rate[-1]
+        errors.append(error @ np.linalg.solve(output.covariance[-1], error) / 3.0)
+    if shared:
+        assert 0.25 < np.mean(errors) < 2.0
+    else:
+        assert np.mean(errors) > 3.0, "or this test shows nothing"
+
+
+def test_a_shared_scale_error_changes_nothing_at_rest_and_hides_no_fault():
+    time = np.arange(round(8.0 * RATE)) / RATE
+    rate = swung(time) * np.clip((time - 3.0) / 2.0, 0.0, 1.0)[:, None]
+    z = np.tile(rate, (1, 3)) + np.random.default_rng(1).normal(0.0, SIGMA, (800, 9))
+    z[600:, 4] += 0.1
+    stamp = START + np.round(1e9 * time).astype(np.int64)
+    plain, allowed = (
+        Pipeline(
+            parallel(3, detector__name="sequential", noise__shared_scale_std=shared)
+        ).process(Block(stamp, z))
+        for shared in (0.0, 0.005)
+    )
+    assert np.abs((allowed.rate - plain.rate)[:600]).max() < 0.2 * SIGMA
+    np.testing.assert_array_equal(allowed.state[-1], plain.state[-1])
+    assert allowed.state[-1, 4] == ChannelState.FAULTY
+    np.testing.assert_allclose(allowed.covariance[:290], plain.covariance[:290], 1e-4)
+    assert (allowed.covariance[580, 0, 0] > plain.covariance[580, 0, 0]).all()
