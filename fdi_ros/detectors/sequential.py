@@ -367,7 +367,7 @@ def fill_verdict(
         sample.estimate.spikes[i] = kf.spikes[i]
         sample.estimate.bias_std[i] = math.sqrt(kf.states.p[i, i])
         sample.estimate.far_bias[i] = kf.far_bias[i]
-        sample.estimate.common[i] = kf.bias_error[i] * kf.bias_error[i]
+        sample.estimate.common[i] = kf.bias_error[i] ** 2 + kf.alike_bias[i] ** 2
         for a in range(3):
             shared = params.layout.shared_scale * kf.signal_rate[a]
             sample.estimate.common[i] += (shared * params.sensors.axes[i, a]) ** 2
@@ -377,6 +377,7 @@ def fill_verdict(
             doubt = case.inference.error_products[i, j] if unsure else 0.0
             # So may all biases, if one that the states have learned is a fault.
             doubt += kf.bias_error[i] * kf.bias_error[j]
+            doubt += kf.alike_bias[i] * kf.alike_bias[j]
             sample.estimate.covariance[i, j] = kf.at.covariance[i, j] + doubt
         if (kf.mask & ~kf.judged) >> i & 1:
             # The channels that it differed from are missing.

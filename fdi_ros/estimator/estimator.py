@@ -295,6 +295,10 @@ class Estimator:
     rest_rates: Window  # of the last blocks, rad/s
     rest_noise: Vector  # variance of the rate of a block, (rad/s)^2
     rest_bias_variance: Vector  # variance of the rate by the biases, (rad/s)^2
+    known_variance: Vector  # the same, however large
+    steady_seconds: Real  # time for which the rate has not changed, s
+    steady_rate: Vector  # rate that may be biases, rad/s, or 0
+    alike_bias: Channels  # the same along each channel, if priors do not explain it
     rest_count: Whole  # blocks in `rest_rates`
     rest: Flag
     unseen: Flag  # nothing is known yet of the motion since a hole

@@ -25,6 +25,9 @@ it a turn may look like a bias, and in loud noise any slow motion like rest."""
 # largest scatter of one second of blocks over noise: exceeded once in 1000 (72 degrees
 # of freedom)
 REST_CHI = 1.6
+STANDS = 5.0
+"""Time after which a rate that does not change is doubted, s: the vehicle turns steadily, or it stands
+still with biases that are beyond what `UNLEARNED` or their priors allow."""
 REST_LAST = 12.0  # largest squared distance of the last block from the mean, to end rest in time
 
 
@@ -38,25 +41,37 @@ def rests(
     last. ``variance`` (c,): of the noise, ``bias_variance`` (c,): of the biases,
     ``floor``: of the rate at rest, all (rad/s)^2.
     """
-    scatter = largest = last = 0.0
+    largest = 0.0
     for a in range(rates.shape[1]):
-        mean = 0.0
-        for k in range(REST_BLOCKS):
-            mean += rates[k, a] / REST_BLOCKS
+        mean = mean_of_blocks(rates, a)
+        largest = max(
+            largest,
+            mean * mean / (floor + variance[a] / REST_BLOCKS + bias_variance[a]),
+        )
+    return largest < THREE_SIGMA and is_steady(rates, newest, variance, floor)
+
+
+@compiled
+def is_steady(rates: Array, newest: int, variance: Array, floor: float) -> bool:
+    """Whether the rates of blocks scatter as noise does about their mean; arguments of `rests`."""
+    scatter = last = 0.0
+    for a in range(rates.shape[1]):
+        mean = mean_of_blocks(rates, a)
         for k in range(REST_BLOCKS):
             gap = rates[k, a] - mean
             scatter += gap * gap / (variance[a] + floor)
             if k == newest:
                 last = max(last, gap * gap / (variance[a] + floor))
-        largest = max(
-            largest,
-            mean * mean / (floor + variance[a] / REST_BLOCKS + bias_variance[a]),
-        )
-    return (
-        scatter < rates.shape[1] * (REST_BLOCKS - 1) * REST_CHI
-        and largest < THREE_SIGMA
-        and last < REST_LAST
-    )
+    return scatter < rates.shape[1] * (REST_BLOCKS - 1) * REST_CHI and last < REST_LAST
+
+
+@compiled
+def mean_of_blocks(rates: Array, a: int) -> float:
+    """Return the mean of one column, rad/s."""
+    mean = 0.0
+    for k in range(REST_BLOCKS):
+        mean += rates[k, a] / REST_BLOCKS
+    return mean
 
 
 @compiled
@@ -83,6 +98,7 @@ def update_rest(params: Constants, kf: Estimator) -> None:
                 known += gain * part
         is_loud = is_loud or variance > REST_BLOCKS * UNLEARNED * UNLEARNED
         kf.rest_noise[a] = variance
+        kf.known_variance[a] = known
         # While biases are uncertain a steady turn looks like biases.
         kf.rest_bias_variance[a] = min(known, UNLEARNED * UNLEARNED)
     kf.rest = rests(
@@ -92,11 +108,37 @@ def update_rest(params: Constants, kf: Estimator) -> None:
         kf.rest_bias_variance,
         params.rest_std * params.rest_std,
     )
-    if kf.noise.regime_seconds[REST] > LONG_TIME or is_loud:
-        # A hover may turn as slowly, but has more noise than rest, or than is expected.
-        for i in range(n):
-            if (
-                kf.masks[1] >> i & 1
-                and kf.noise.now.block[i] > REST_RATIO * kf.noise.kept[REST].block[i]
-            ):
-                kf.rest = kf.rest and kf.noise.regime == REST
+    # A hover may turn as slowly, but has more noise than rest, or than is expected.
+    compares = kf.noise.regime_seconds[REST] > LONG_TIME or is_loud
+    if compares and kf.noise.regime != REST and is_louder_than_rest(params, kf):
+        kf.rest = False
+    # Accelerometers feel gravity, which does not change either.
+    if not params.gain_is_fault and not is_loud:
+        follow_steady_rate(params, kf, newest)
+
+
+@compiled
+def is_louder_than_rest(params: Constants, kf: Estimator) -> bool:
+    """Whether a channel has much more noise than at rest."""
+    for i in range(params.sensors.n):
+        noise = kf.noise.now.block[i]
+        if kf.masks[1] >> i & 1 and noise > REST_RATIO * kf.noise.kept[REST].block[i]:
+            return True
+    return False
+
+
+@compiled
+def follow_steady_rate(params: Constants, kf: Estimator, newest: int) -> None:
+    """Note a rate that does not change for `STANDS`, until the vehicle is known to rest.
+
+    It may be a turn, or what is left of the biases: no comparison tells which.
+    """
+    steady = is_steady(
+        kf.rest_rates, newest, kf.rest_noise, params.rest_std * params.rest_std
+    )
+    kf.steady_seconds = kf.steady_seconds + kf.span if steady else 0.0
+    for a in range(3):
+        if kf.rest:
+            kf.steady_rate[a] = 0.0
+        elif kf.steady_seconds >= STANDS:
+            kf.steady_rate[a] = mean_of_blocks(kf.rest_rates, a)

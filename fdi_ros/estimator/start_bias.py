@@ -15,12 +15,17 @@ from __future__ import annotations
 import math
 
 from fdi_ros.compiling.compiled import compiled
+from fdi_ros.core.algebra import along
 from fdi_ros.estimator.estimator import Constants, Estimator
 
 FAR = 4.0
 """Standard deviations from which a bias is far beyond its prior: one healthy start in 16 000."""
 DOUBTED = 3.0
 """The same from which the covariance allows for it, in full from `FAR` on."""
+FARTHEST = 12.0
+"""Multiple of ``turn_on_std`` from which a steady rate is a turn, whatever the biases."""
+UNSHOWN = 0.25
+"""Least share of the variance by biases that must be left: a rest, however short, leaves less."""
 LEAST_SHOWN = 0.05
 """Least share of its prior variance that must be known of a bias."""
 
@@ -33,6 +38,7 @@ def doubt_start(params: Constants, kf: Estimator) -> None:
     """
     n = params.sensors.n
     states = kf.states
+    doubt_steady_rate(params, kf)
     for i in range(n):
         kf.far_bias[i] = kf.bias_error[i] = 0.0
     if params.turn_on == 0.0:
@@ -48,13 +54,48 @@ def doubt_start(params: Constants, kf: Estimator) -> None:
     if worst < 0:
         return
     shown = prior_variance(params, kf.seconds, worst) - states.p[worst, worst]
-    range_of_weight = FAR * FAR - DOUBTED * DOUBTED
-    weight = math.sqrt(min((largest - DOUBTED * DOUBTED) / range_of_weight, 1.0))
+    weight = weight_of(largest)
     for i in range(n):
         error = states.p[i, worst] * states.x[worst] / shown
         kf.bias_error[i] = weight * error
         if largest > FAR * FAR:
             kf.far_bias[i] = far_bias(params, kf, i, worst)
+
+
+@compiled
+def weight_of(ratio: float) -> float:
+    """Return the share of an error that the covariance allows for: all from `FAR` squared on."""
+    beyond = (ratio - DOUBTED * DOUBTED) / (FAR * FAR - DOUBTED * DOUBTED)
+    return math.sqrt(max(min(beyond, 1.0), 0.0))
+
+
+@compiled
+def doubt_steady_rate(params: Constants, kf: Estimator) -> None:
+    """Doubt a steady rate that is far beyond the priors of biases that no rest has shown.
+
+    If all biases are off alike, the vehicle stands still.
+    """
+    largest = square = 0.0
+    for a in range(3):
+        known = kf.known_variance[a]
+        square += kf.steady_rate[a] ** 2
+        if known > UNSHOWN * alike_variance(params, kf, a):
+            largest = max(largest, kf.steady_rate[a] ** 2 / known)
+    if square > (FARTHEST * params.turn_on) ** 2:
+        largest = 0.0
+    for i in range(params.sensors.n):
+        kf.alike_bias[i] = weight_of(largest) * along(
+            params.sensors.axes[i], kf.steady_rate
+        )
+
+
+@compiled
+def alike_variance(params: Constants, kf: Estimator, a: int) -> float:
+    """Return the variance of the rate by the biases before any rest, (rad/s)^2."""
+    variance = 0.0
+    for i in range(params.sensors.n):
+        variance += (kf.fused.gain[a, i] * params.turn_on) ** 2
+    return variance
 
 
 @compiled

@@ -119,3 +119,41 @@ def test_a_gyro_that_is_wrong_from_the_start_is_no_healthy_one(size: float) -> N
     states = {one.name: one.state for one in status.channels}
     assert far(status) == ["imu_2.y"] or states["imu_2.y"] is ChannelState.FAULTY
     assert live_word(status, ()) in (Word.CANNOT_TELL, Word.FAULTY)
+
+
+def stand_and_move(
+    bias: float, turn: float, rested: bool, seed: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return NEES/3 of the rate before and after 30 s, in which biases or a turn do not change.
+
+    All gyros of three units have the same bias, rad/s. Then the vehicle moves.
+    """
+    config = Config.from_file("ardupilot.yaml")
+    t = np.arange(0.0, 50.0, 1.0 / config.sample_rate)
+    random = np.random.default_rng(seed)
+    rate = np.zeros((len(t), 3))
+    rate[(t > 10.0) | ~np.full(len(t), rested)] = [0.0, 0.6 * turn, 0.8 * turn]
+    moves = t > 40.0
+    phase = np.outer(t[moves] - 40.0, [0.8, 1.1, 0.5])
+    rate[moves] = [0.5, 0.4, 0.3] * np.sin(phase)
+    z = np.tile(rate + bias * np.array([0.0, 0.6, 0.8]), (1, 3))
+    z += random.normal(0.0, 0.002, z.shape)
+    output = Pipeline(config).process(Block(10**9 + (1e9 * t).astype(np.int64), z))
+    error = (output.rate - rate)[:, :, None]
+    solved = np.linalg.solve(output.covariance, error)
+    nees = np.sum(error * solved, axis=(1, 2)) / 3.0
+    return nees[(t > 20.0) & ~moves], nees[t > 42.0]
+
+
+@pytest.mark.parametrize("size", [5.0, 6.0, 10.0])
+def test_standing_still_with_equal_biases_is_no_certain_turn(size: float) -> None:
+    """ArduPilot's gyros after its calibration failed: their rates agree, and do not change."""
+    for nees in stand_and_move(size * 0.005, 0.0, rested=False):
+        assert 0.1 < nees.mean() < 2.0
+
+
+@pytest.mark.parametrize(("turn", "rested"), [(0.04, True), (0.3, False)])
+def test_a_steady_turn_stays_certain(turn: float, rested: bool) -> None:
+    """After a rest the biases are known, and no biases explain a fast turn."""
+    for nees in stand_and_move(0.0, turn, rested):
+        assert 0.05 < nees.mean() < 2.0
