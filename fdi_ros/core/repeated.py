@@ -125,6 +125,20 @@ def has_moved(
 
 
 @compiled
+def without_old_units(core: Core, subsets: NDArray[Any], mask: int) -> int:
+    """Return the channels of a mask without those of units whose values are certainly old.
+
+    Old values disagree with the others as soon as the vehicle moves, which would hide
+    the motion. They stay where the rest could not disagree without them: a fault of the
+    only other unit looks like motion.
+    """
+    old = without_coarse_steps(core.settings, core.health, core.now.repeated)
+    rest = mask & ~old
+    checks_itself = rest & ~subsets[rest].detectable == 0
+    return rest if rest and checks_itself else mask
+
+
+@compiled
 def update_stuck(core: Core, subsets: NDArray[Any], mask: int, stamp: int) -> int:
     """Return the mask of stuck channels.
 
@@ -133,6 +147,7 @@ def update_stuck(core: Core, subsets: NDArray[Any], mask: int, stamp: int) -> in
     n = core.settings.n
     now = core.now
     stuck = 0
+    mask = without_old_units(core, subsets, mask)
     subset = subsets[mask]
     if now.evidence.repeats & now.usable:
         fill_disagreement(core.settings, now, subset, mask)
@@ -150,7 +165,7 @@ def update_stuck(core: Core, subsets: NDArray[Any], mask: int, stamp: int) -> in
             isolated = now.verdict.suspects[i] and now.verdict.isolated
             if now.verdict.alarm and not isolated:
                 continue
-            share = subset.sensitivity[i]
+            share = subsets[mask | 1 << i].sensitivity[i]
             noise = core.settings.sensors.noise_std[i]
             spread = math.sqrt(
                 (noise * noise + step * step / 12.0) / (share if share > 0 else 0.5)

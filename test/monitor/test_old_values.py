@@ -6,6 +6,7 @@
 import numpy as np
 import pytest
 from monitor.streams import (
+    RATE,
     SIGMA,
     body_rate,
     config,
@@ -51,6 +52,35 @@ def test_beside_a_unit_that_repeats_old_values_the_others_still_check_each_other
     assert not (output.state == FAULTY).any()
     off = np.abs(output.rate - body_rate(900))[720:, 0]
     assert (off < 3 * np.sqrt(output.covariance[720:, 0, 0])).all()
+
+
+def slowly(samples: int, start: int) -> np.ndarray:
+    """Return a rotation about all axes that begins at a row and gets faster, (N, 3) rad/s."""
+    since = np.maximum(np.arange(samples) - start, 0) / RATE
+    return np.outer(since, [0.04, -0.036, 0.032])
+
+
+def test_a_unit_that_repeats_is_found_in_a_motion_about_all_axes():
+    """Its old values disagree about each axis, and are no doubt of the motion that the others measure."""
+    pipeline = Pipeline(parallel(3, **SEQUENTIAL))
+    block = stream(pipeline.geometry, 900, size=0.0)
+    block.z[:] += np.tile(slowly(900, 600), 3)
+    output = pipeline.process(repeated(block, 600, 900))
+    # Six standard deviations of the difference to the two others are 18 mrad/s.
+    assert (output.state[660:, THIRD] == AMBIGUOUS).all()
+    assert (output.state[:630, THIRD] != AMBIGUOUS).all()
+    assert {one.reason for one in output.events if one.declares} == {Reason.OLD}
+    assert (output.state[300:, :6] == OK).all()
+
+
+def test_a_unit_that_moves_alone_is_no_motion_for_others_in_coarse_steps():
+    pipeline = Pipeline(parallel(3, **SEQUENTIAL))
+    block = stream(pipeline.geometry, 900, size=0.0)
+    noise = np.random.default_rng(3).normal(0, 0.15, block.z.shape)
+    block.z[:] = np.round(noise) * SIGMA
+    block.z[:, :3] += slowly(900, 600)
+    output = pipeline.process(block)
+    assert not np.isin(output.state[:, 3:], (AMBIGUOUS, FAULTY)).any()
 
 
 def test_beside_a_fault_at_rest_values_in_coarse_steps_are_not_old_nor_called_checked():

@@ -60,6 +60,11 @@ def test_every_fault_of_the_simulated_flight_is_named_or_held_in_a_set_and_none_
     assert len({one.channels for one in named}) >= 6
     # A scale factor that is off by 5 % is 0.5 m/s^2 under gravity.
     assert {"imu_3.accel_z"} in [set(one.channels) for one in named]
+    # The others have moved by more than their noise 0.7 s after a unit has frozen.
+    (frozen,) = (float(row[0]) - BEGINS for row in rows if row[4] == "no_new_samples")
+    held = next(one for one in summary.story.episodes if one.start_s > frozen)
+    assert (held.state, len(held.channels)) == ("AMBIGUOUS", 3)
+    assert held.start_s - frozen < 0.8
     # Noise five times as large declares nothing, and is reported.
     (noise,) = (one for one in summary.concerns if "had noise" in str(one))
     assert str(noise).startswith("imu_1.accel had noise ")
