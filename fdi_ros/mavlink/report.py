@@ -210,6 +210,7 @@ _STATES = {
 }  # severity and words by state
 _QUIET = ("OK", "AMBIGUOUS")  #: Not announced beside failover.
 _FINE = ("OK", "UNCHECKED", "EXCLUDED")
+IN_BOTH_HALVES = "faulty (gyros and accelerometers)"
 NOTHING_SEEN = "no further fault would be detected"
 
 
@@ -323,6 +324,7 @@ class Announcer:
                 for names in alike
                 if names not in quiet and not self._is_contradicted(names)
             ]
+        alike = self._with_accelerometers(alike)
         pending = [(self._text(names), names) for names in alike]
         # The gravest first.
         told = sorted(pending, key=lambda one: one[0][0])[: int(self._tokens)]
@@ -358,6 +360,34 @@ class Announcer:
             key=lambda names: names != (MONITOR_LINE,),
         )
 
+    def _with_accelerometers(
+        self, alike: list[tuple[str, ...]]
+    ) -> list[tuple[str, ...]]:
+        """Join the accelerometers of a unit to its gyros, if its fault shows in both.
+
+        At least two accelerometers are named, and all gyros, or a set of two at least.
+        """
+        joined = []
+        told: set[str] = set()
+        for names in alike:
+            units = {name.rpartition(".")[0] for name in names}
+            beside = []
+            if len(names) > 1 and len(units) == 1:
+                is_good = self._now[names[0]][0] == "OK"
+                beside = [
+                    one
+                    for (one, *others) in alike
+                    if one in self._forces
+                    and not others
+                    and one.rpartition(".")[0] in units
+                    and (self._now[one][0] == "OK") == is_good
+                ]
+            if len(beside) > 1:
+                told.update(beside)
+                names = (*names, *beside)
+            joined.append(names)
+        return [names for names in joined if names[0] not in told]
+
     def _text(self, names: tuple[str, ...]) -> tuple[int, str]:
         """Return the text about a group of channels, or about the whole."""
         state, group = self._now[names[0]]
@@ -367,8 +397,12 @@ class Announcer:
                 if state
                 else (INFO, "FDI: all is judged again")
             )
+        gyros = [name for name in names if name not in self._forces]
+        who = names[0].rpartition(".")[0] if len(names) > 1 else names[0]
+        is_both = 0 < len(gyros) < len(names)
         if state == "AMBIGUOUS":
-            return WARNING, self._set_text(group)
+            both = _fit(who, IN_BOTH_HALVES)
+            return WARNING, both if is_both else self._set_text(group)
         severity, words = _STATES.get(state, (INFO, "agrees again"))
         if names[0] in self._forces:
             if state in ("FAULTY", FAR) and self._errors[names[0]] > 0.0:
@@ -377,10 +411,10 @@ class Announcer:
                 # Two that differ: either may be the one.
                 words = words.replace("m/s^2", "m/s^2?") if state == FAR else words
             return max(severity, WARNING), _fit(self._forces[names[0]], words)
-        if state == "FAULTY" and max(map(self._errors.__getitem__, names)) < GRAVE:
+        if state == "FAULTY" and max(map(self._errors.__getitem__, gyros)) < GRAVE:
             severity = WARNING
-        who = names[0].rpartition(".")[0] if len(names) > 1 else names[0]
-        return severity, _fit(who, words)
+        is_faulty = state == "FAULTY"
+        return severity, _fit(who, IN_BOTH_HALVES if is_both and is_faulty else words)
 
     def _set_text(self, group: str) -> str:
         """Return the text for a set, given as names with commas between. Whole units are named."""

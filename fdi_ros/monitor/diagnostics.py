@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from enum import IntEnum
 from itertools import chain
@@ -18,7 +18,13 @@ from fdi_ros.core.sources import source_of
 from fdi_ros.core.states import ChannelState, Reason
 from fdi_ros.model.quantity import FORCE
 from fdi_ros.monitor.output import Topic
-from fdi_ros.monitor.soundness import DECLARED, Concern, Word, live_word
+from fdi_ros.monitor.soundness import (
+    DECLARED,
+    Concern,
+    Word,
+    live_word,
+    units_in_both_halves,
+)
 from fdi_ros.system.text import figures, first_of, percent, plus_minus, shown
 
 if TYPE_CHECKING:
@@ -361,15 +367,23 @@ def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[st
         for channel in status.channels
         if channel.state == ChannelState.FAULTY
     }
+    wholly = {unit.name for unit in status.units if faulty.issuperset(unit.channels)}
+    both = set(units_in_both_halves(status.channels)) - wholly
     words += [
         f"{unit.name} as a whole is faulty"
         for unit in status.units
-        if faulty.issuperset(unit.channels)
+        if unit.name in wholly
+    ]
+    words += [
+        f"{unit.name} (gyros and accelerometers) is faulty, as a whole or in part"
+        for unit in status.units
+        if unit.name in both
     ]
     groups = dict.fromkeys(
         channel.group for channel in status.channels if channel.group
     )
-    words += filter(None, (_format_unit_set(group, status.units) for group in groups))
+    sets = (_format_unit_set(group, status, both) for group in groups)
+    words += filter(None, sets)
     return words if status.apart is None else [*words, str(status.apart)]
 
 
@@ -377,12 +391,27 @@ def _format_frozen(unit: UnitStatus) -> str:
     return f"{unit.name} frozen: all values have repeated for {_seconds(unit.frozen)} while the others measure motion"
 
 
-def _format_unit_set(group: Sequence[str], units: Sequence[UnitStatus]) -> str:
-    """Return a sentence if a set consists of whole units, else an empty text."""
-    inside = [unit for unit in units if set(group).issuperset(unit.channels)]
-    if not inside or sum(len(unit.channels) for unit in inside) != len(group):
+def _format_unit_set(
+    group: Sequence[str], status: Status, told: Collection[str] = ()
+) -> str:
+    """Return a sentence if a set consists of whole units in one half, else an empty text.
+
+    ``told``: units that another sentence is about.
+    """
+    measures = {channel.name: channel.unit for channel in status.channels}
+    half = measures.get(group[0])
+    inside = {
+        unit.name: own
+        for unit in status.units
+        if (own := {one for one in unit.channels if measures.get(one) == half})
+        and own.issubset(group)
+    }
+    if not inside or sum(map(len, inside.values())) != len(group):
         return ""
-    who = f"{'one of ' if len(inside) > 1 else ''}{', '.join(unit.name for unit in inside)}"
+    if len(inside) == 1 and not inside.keys().isdisjoint(told):
+        return ""
+    names = [f"{name}.accel" if half == FORCE.unit else name for name in inside]
+    who = f"{'one of ' if len(names) > 1 else ''}{', '.join(names)}"
     return f"{who} is faulty, as a whole or in part: undecided"
 
 
@@ -531,7 +560,7 @@ def _format_set(channel: ChannelStatus, status: Status) -> str:
     if len(channel.group) == 1:
         return "probably faulty, to be confirmed"
     one_of = f"one of {', '.join(channel.group)} is faulty, undecided"
-    return (_format_unit_set(channel.group, status.units) or one_of) + (
+    return (_format_unit_set(channel.group, status) or one_of) + (
         f"; seen on {pair}" if pair else ""
     )
 

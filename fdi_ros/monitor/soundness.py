@@ -336,6 +336,26 @@ def live_word(status: Status, concerns: Sequence[Concern]) -> Word:
     return word_of(concerns)
 
 
+def units_in_both_halves(channels: Iterable[ChannelStatus]) -> list[str]:
+    """Return the units with a fault that shows in gyros and accelerometers at once.
+
+    Such a unit is loose, frozen, turned or set to a wrong range. In each half two of its
+    channels at least are faulty, or a set is of this unit alone.
+    """
+    shown: dict[str, dict[str, int]] = {}
+    for one in channels:
+        unit = one.name.rpartition(".")[0]
+        others = {name.rpartition(".")[0] for name in one.group} - {unit}
+        if unit and one.state in DECLARED and not others:
+            halves = shown.setdefault(unit, {})
+            halves[one.unit] = halves.get(one.unit, 0) + 1
+    return [
+        unit
+        for unit, halves in shown.items()
+        if len(halves) > 1 and min(halves.values()) > 1
+    ]
+
+
 def is_declared_or_silent(channel: ChannelStatus) -> bool:
     """Whether a channel is declared faulty, alone or in a set, or is silent."""
     return channel.state in (*DECLARED, ChannelState.STALE)

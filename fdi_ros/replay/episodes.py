@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.report.layout import FORCES, RADIANS, Unit
-from fdi_ros.system.text import figures, percent, plus_minus
+from fdi_ros.system.text import figures, listed, percent, plus_minus
 
 STRETCH_GAP = 10.0
 """Gap between two stretches, s. A shorter hole is within a stretch: messages were lost."""
@@ -37,9 +37,13 @@ def pieces(stamp: NDArray[np.int64], longest: float = HOLE) -> list[slice]:
     return [slice(begin, end) for begin, end in pairwise(edges) if end > begin]
 
 
+BRIEF = 1.0
+"""A fault that stands for less is reported with its duration, s."""
 ACROSS_HALVES = 5.0
 """Largest time between the first signs of a fault of a unit in its gyros and in its
 accelerometers, s."""
+MOST_STEPS = 20
+"""Largest number of steps of an episode. The last step is always kept."""
 DECLARED = ("FAULTY", "AMBIGUOUS")
 """States of an episode with a declared fault. The other state, STALE, means no data."""
 Course = Literal[
@@ -170,6 +174,10 @@ class Episode:
     """Unit of sizes and standard deviations: rad/s, or m/s^2 for accelerometers."""
     injected: tuple[str, ...] = ()
     """Injected faults that explain the episode."""
+    sets: int = 1
+    """Number of sets that came and went, and are one fault of the units in them."""
+    longest_s: float | None = None
+    """Length of the longest of these sets, s. None: there is only one."""
     halves: tuple[Episode, ...] = ()
     """Episodes of gyros and of accelerometers that are one fault of their unit. Empty: a fault of one
     kind of sensor. The halves have the candidates."""
@@ -183,6 +191,16 @@ class Episode:
     def declares(self) -> bool:
         """Whether a fault was declared. Otherwise the channels only delivered no data."""
         return self.state in DECLARED
+
+    @property
+    def is_brief(self) -> bool:
+        """Whether it is a set that ended within `BRIEF`, or sets that all did."""
+        if self.halves:
+            return all(half.is_brief for half in self.halves)
+        if self.longest_s is not None:
+            return self.longest_s < BRIEF
+        length = self.end_s - self.since_s
+        return self.state == "AMBIGUOUS" and not self.stands and length < BRIEF
 
     @property
     def ever(self) -> frozenset[str]:
@@ -241,7 +259,9 @@ def join_halves(
     """Join episodes of the gyros and of the accelerometers of a unit that begin together.
 
     A unit that is loose, frozen, turned, silent or set to a wrong range shows in both, with
-    two channels of each at least. ``unit_of``: unit of each channel.
+    two channels of each at least. Of two units neither may be the loose one for sure:
+    sets that come and go are joined where they are of the same units. ``unit_of``: unit of
+    each channel.
     """
     joined = []
     left = list(episodes)
@@ -251,16 +271,27 @@ def join_halves(
         parts = [
             one
             for one in left
-            if len(units) == 1
-            and all(units)
+            if all(units)
+            and (len(units) == 1 or one.sets > 1 < first.sets)
             and _is_of_unit(one, first, unit_of, units)
         ]
-        shown = {one.measured_in for one in parts if len(one.channels) > 1}
+        recurs = any(one.sets > 1 for one in parts)
+        shown = {one.measured_in for one in parts if _shows_unit(one, recurs)}
         if len(shown) < len(HALVES):
             parts = [first]
         left = [one for one in left if one not in parts]
-        joined.append(first if len(parts) == 1 else _whole(parts, *units))
+        joined.append(first if len(parts) == 1 else _whole(parts, sorted(units)))
     return joined
+
+
+def _shows_unit(one: Episode, recurs: bool) -> bool:
+    """Whether an episode shows a fault of a whole unit, and not of one channel.
+
+    ``recurs``: beside it, sets of the unit come and go. Then one that was a set at first
+    is one more of these.
+    """
+    is_set = recurs and one.state == "AMBIGUOUS" and len(one.ever) > 1
+    return len(one.channels) > 1 or is_set
 
 
 def _is_of_unit(
@@ -274,8 +305,9 @@ def _is_of_unit(
     )
 
 
-def _whole(parts: Sequence[Episode], unit: str) -> Episode:
-    """Return the episode of a unit that its gyros and its accelerometers show."""
+def _whole(parts: Sequence[Episode], units: Sequence[str]) -> Episode:
+    """Return the episode of a unit, or of one of some, that gyros and accelerometers show."""
+    unit = listed(units, "or")
     by_half = [[one for one in parts if one.measured_in == name] for name in HALVES]
     channels = dict.fromkeys(
         name for half in by_half for one in half for name in one.channels
@@ -390,6 +422,8 @@ def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
         return f"{one.who} {one.state} from {one.since_s:.3f} s: {parts}"
     unit = unit_for(one, unit)
     until = "" if one.stands else f" to {one.end_s:.3f} s"
+    if one.sets > 1:
+        until += f", {one.sets} times"
     about = _about(one, unit)
     before = _before(one)
     if not before and one.since_s - one.start_s >= LEAST_BEFORE:
@@ -459,6 +493,8 @@ def _about(one: Episode, unit: Unit) -> str:
 
 def _before(one: Episode) -> str:
     """Return the candidates of earlier steps: those of the first, and of the last if few and others."""
+    if one.sets > 1:
+        return ""
     # A channel that was the only candidate, but not yet confirmed, is no step of its own.
     earlier = [step for step in one.steps[:-1] if step.channels != one.channels]
     chosen = earlier[:1]

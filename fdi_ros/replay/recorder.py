@@ -37,6 +37,7 @@ from fdi_ros.model.samples import Array
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.episodes import (
     HOLE,
+    MOST_STEPS,
     Apart,
     Candidate,
     Course,
@@ -63,8 +64,6 @@ _DECLARED, _EPISODE_STATES, _HIDING = (
 
 #: Episodes with details. Further ones are only counted.
 MOST_EPISODES = 1000
-MOST_EPISODE_STEPS = 20
-"""Largest number of steps of an episode. The last step is always kept."""
 UNIT_SILENCE = 0.5
 """Channels of a unit that fall silent within this time, s, belong to one episode."""
 SILENCE_AFTER_HOLE = 0.5
@@ -352,7 +351,7 @@ class Recorder:
         names = tuple(self._geometry.channel_names[i] for i in channels)
         step = Step(round(at, 9), one.kind.name, names, say(self._geometry, channels))
         if one.steps and (
-            one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_EPISODE_STEPS
+            one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_STEPS
         ):
             one.steps.pop()
         one.steps.append(step)

@@ -45,6 +45,7 @@ from fdi_ros.replay.health import (
 )
 from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
+from fdi_ros.replay.recurring import join_recurring
 from fdi_ros.replay.summary import (
     AutopilotText,
     BiasResult,
@@ -415,7 +416,7 @@ def _joined(stories: Sequence[Story], unit_of: Mapping[str, str]) -> Story:
     episodes.sort(key=lambda one: (one.start_s, one.since_s))
     return Story(
         stories[0].stretches,
-        tuple(join_halves(episodes, unit_of)),
+        tuple(join_halves(join_recurring(episodes, unit_of), unit_of)),
         sum(story.more for story in stories),
     )
 

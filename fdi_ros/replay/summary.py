@@ -29,9 +29,6 @@ from fdi_ros.system.text import figures
 if TYPE_CHECKING:
     import pandas
 
-BRIEF = 1.0
-"""A fault that stands for less is reported with its duration, s."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelResult(ChannelHealth):
@@ -217,12 +214,7 @@ class Judgement:
 
         Evidence for one channel does not last while its error changes its sign, as noise does.
         """
-        return all(
-            one.state == "AMBIGUOUS"
-            and not one.stands
-            and one.end_s - one.since_s < BRIEF
-            for one in self.story.declared
-        )
+        return all(one.is_brief for one in self.story.declared)
 
     def _was_faulty(self, channel: ChannelHealth) -> bool:
         """Whether a channel was named faulty while it was noisy."""

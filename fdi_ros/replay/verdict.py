@@ -14,6 +14,7 @@ from collections.abc import Collection, Sequence
 from fdi_ros.core.states import Reason
 from fdi_ros.monitor.soundness import Concern, Trouble, Word, advice_on, word_of
 from fdi_ros.replay.episodes import (
+    BRIEF,
     LEAST_BEFORE,
     MOST_TOLD,
     Episode,
@@ -24,7 +25,7 @@ from fdi_ros.replay.episodes import (
     true_quantity,
     unit_for,
 )
-from fdi_ros.replay.summary import BRIEF, Judgement, ReplayVerdict
+from fdi_ros.replay.summary import Judgement, ReplayVerdict
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.system.text import figures, first_of, listed, percent
 
@@ -325,6 +326,8 @@ def _who(one: Episode) -> str:
         return one.who
     parts = [name.rpartition(".") for name in one.channels]
     units = {unit for unit, _, _ in parts}
+    if one.sets > 1 and len(units) == 1 and "" not in units:
+        return parts[0][0]
     if one.state == "AMBIGUOUS":
         return _one_of(one) if len(parts) > 1 else f"{one.who} (not confirmed)"
     if one.state != "FAULTY" or len(parts) == 1 or len(units) > 1 or "" in units:
@@ -424,6 +427,9 @@ def _share_words(share: float, unit: Unit) -> str:
 
 def _reason_sentences(one: Episode) -> list[str]:
     """Return a sentence on the reason, unless the reason is a mere disagreement."""
+    if recurring := [half for half in one.halves or (one,) if half.sets > 1]:
+        sets = max(half.sets for half in recurring)
+        return [f"It came and went {sets} times, as the error of a loose unit does."]
     reason = one.evidence.reason
     common = (Reason.DISAGREES.value, Reason.DRIFTED.value, Reason.NO_DATA.value)
     if one.state != "FAULTY" or not reason or reason.startswith(common):

@@ -101,6 +101,45 @@ def test_an_accelerometer_that_is_wrong_from_the_start_is_told() -> None:
     assert len(text) <= TEXT_LENGTH
 
 
+@pytest.mark.parametrize(
+    ("state", "severity"), [("FAULTY", CRITICAL), ("AMBIGUOUS", WARNING)]
+)
+def test_a_fault_of_a_unit_in_gyros_and_accelerometers_is_one_text(
+    state, severity
+) -> None:
+    group = "imu_2.x, imu_2.y, imu_2.z" if state == "AMBIGUOUS" else ""
+    gyros = [report(f"imu_2.{axis}", state, group, error="0.5") for axis in "xyz"]
+    forces = [force(f"imu_2.accel_{axis}", "FAULTY", "5.0") for axis in "xyz"]
+    text = "FDI: imu_2 faulty (gyros and accelerometers)"
+    assert len(text) <= TEXT_LENGTH
+    ground = Ground()
+    assert ground.hear(*gyros, *forces) == [(severity, text)]
+    good = [report(f"imu_2.{axis}", "OK") for axis in "xyz"]
+    well = [force(f"imu_2.accel_{axis}", "OK") for axis in "xyz"]
+    assert ground.hear(*good, *well) == [(INFO, "FDI: imu_2 agrees again")]
+
+
+def test_a_single_accelerometer_or_one_of_another_unit_is_a_text_of_its_own() -> None:
+    gyros = [report(f"imu_2.{axis}", "FAULTY", error="0.5") for axis in "xyz"]
+    one = force("imu_2.accel_x", "FAULTY", "5.0")
+    other = force("imu_3.accel_x", "FAULTY", "5.0")
+    expected = {
+        (CRITICAL, "FDI: imu_2 faulty"),
+        (WARNING, "FDI: accelerometer x of IMU 2 off by 5.0 m/s^2"),
+        (WARNING, "FDI: accelerometer x of IMU 3 off by 5.0 m/s^2"),
+    }
+    assert set(Ground().hear(*gyros, one, other)) == expected
+
+
+def test_beside_failover_accelerometers_are_told_though_a_set_of_gyros_is_not() -> None:
+    group = "imu_2.x, imu_2.y, imu_2.z"
+    gyros = [report(f"imu_2.{axis}", "AMBIGUOUS", group) for axis in "xyz"]
+    forces = [force(f"imu_2.accel_{axis}", "FAULTY", "5.0") for axis in "xyz"]
+    told = Ground(apart=lambda unit: 1.0).hear(*gyros, *forces)
+    assert len(told) == 3
+    assert all("accelerometer" in text for _, text in told)
+
+
 def test_declarations_are_told_and_suspicions_are_not() -> None:
     ground = Ground()
     assert ground.hear(report("imu_2.y", "SUSPECT")) == []

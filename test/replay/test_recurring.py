@@ -1,0 +1,105 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Sets that come and go are one episode of the unit that was in all of them."""
+
+from dataclasses import replace
+
+import pytest
+
+from fdi_ros.replay.episodes import Episode, Evidence, RateMeanwhile, Step, join_halves
+from fdi_ros.replay.recurring import LEAST_SETS, RECURS_WITHIN, join_recurring
+
+UNIT_OF = {
+    f"imu_{unit}.{kind}{axis}": f"imu_{unit}"
+    for unit in (1, 2, 3)
+    for kind in ("", "accel_")
+    for axis in "xyz"
+}
+GYROS = ("imu_3.x", "imu_3.y", "imu_3.z")
+FORCES = ("imu_3.accel_x", "imu_3.accel_y", "imu_3.accel_z")
+
+
+def episode(start, channels=GYROS, length=0.4, last=None, **changes):
+    """A set of some channels that ends as one of the last ones for 10 ms."""
+    steps = [Step(start, "AMBIGUOUS", channels, "a set")]
+    if last is not None:
+        steps.append(Step(start + length, "AMBIGUOUS", last, "the last"))
+        length += 0.01
+    one = Episode(
+        stretch=1,
+        state="AMBIGUOUS",
+        channels=steps[-1].channels,
+        who=steps[-1].who,
+        start_s=start,
+        since_s=steps[-1].at_s,
+        end_s=start + length,
+        stands=False,
+        steps=tuple(steps),
+        candidates=(),
+        apart=None,
+        evidence=Evidence("disagrees with the others", 1.5, 3, start),
+        rate=RateMeanwhile(1.0, 0.002, 0.002, 0.1),
+        measured_in="m/s^2" if "accel" in channels[0] else "rad/s",
+    )
+    return replace(one, **changes)
+
+
+def test_sets_that_come_and_go_are_one_of_the_unit_in_all_of_them():
+    """A set of a healthy channel as evidence fades names it in no episode."""
+    every = tuple(name for name in UNIT_OF if "accel" not in name)
+    run = [
+        episode(6.0, last=("imu_3.z",)),
+        episode(7.0, last=("imu_1.x",)),
+        episode(8.0, length=0.1, channels=every),
+        episode(9.0, length=2.0),
+    ]
+    (one,) = join_recurring(run, UNIT_OF)
+    assert (one.channels, one.who, one.sets) == (GYROS, "a set", 4)
+    assert (one.start_s, one.since_s, one.end_s) == (6.0, 6.0, 11.0)
+    assert (one.longest_s, one.evidence.alarms) == (2.0, 12)
+    assert not one.is_brief
+    assert "a set AMBIGUOUS from 6.000 s to 11.000 s, 4 times" in one.words
+    assert join_recurring(run[:3], UNIT_OF)[0].is_brief
+
+
+@pytest.mark.parametrize(
+    "last",
+    [
+        episode(8.0, state="FAULTY"),
+        episode(8.0, channels=("imu_1.x", "imu_2.x")),
+        episode(7.4 + RECURS_WITHIN + 0.01),
+        episode(8.0, stretch=2),
+        episode(8.0, channels=FORCES),
+    ],
+)
+def test_what_may_be_another_fault_stays_an_episode(last):
+    run = [*(episode(5.0 + k) for k in range(LEAST_SETS - 1)), last]
+    assert join_recurring(run, UNIT_OF) == run
+    third = replace(run[1], start_s=7.0, since_s=7.0, end_s=7.4)
+    third = replace(third, steps=(Step(7.0, "AMBIGUOUS", GYROS, "a set"),))
+    whole, other = join_recurring([*run[:2], third, last], UNIT_OF)
+    assert (whole.sets, other) == (3, last)
+
+
+def test_sets_of_two_units_are_of_either():
+    pair = ("imu_1.z", "imu_2.z")
+    run = [episode(5.0 + k, pair, last=(pair[k % 2],)) for k in range(5)]
+    (one,) = join_recurring(run, UNIT_OF)
+    assert one.channels == pair
+
+
+def test_gyros_and_accelerometers_that_come_and_go_are_one():
+    gyros = [episode(6.0 + k) for k in range(4)]
+    forces = [episode(6.1 + k, FORCES) for k in range(4)]
+    run = sorted([*gyros, *forces], key=lambda one: one.start_s)
+    (one,) = join_halves(join_recurring(run, UNIT_OF), UNIT_OF)
+    assert one.who == "imu_3 (gyros and accelerometers)"
+    assert set(one.channels) == {*GYROS, *FORCES}
+    assert [half.sets for half in one.halves] == [4, 4]
+    assert one.is_brief
+    # One set of the other half, which ends as one channel, belongs to them too.
+    single = episode(6.1, FORCES, last=FORCES[2:])
+    assert len(join_halves(join_recurring([*gyros, single], UNIT_OF), UNIT_OF)) == 1
+    # Beside a fault of a single channel it is another one.
+    assert len(join_halves([gyros[0], single], UNIT_OF)) == 2
