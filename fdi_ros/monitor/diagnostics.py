@@ -399,7 +399,7 @@ def _format_unit_set(
     ``told``: units that another sentence is about.
     """
     measures = {channel.name: channel.unit for channel in status.channels}
-    half = measures.get(group[0])
+    half = measures.get(group[0]) if group else None
     inside = {
         unit.name: own
         for unit in status.units
