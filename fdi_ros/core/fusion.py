@@ -165,7 +165,7 @@ def update_gain(
             expected = variance_of(sensors, i, rate_along, acceleration.value)
             now.variance[i] = max(now.variance[i], expected)
         now.uncertainty[i] = now.variance[i] + estimate.covariance[i, i]
-        now.own[i] = now.uncertainty[i] - estimate.common[i]
+        now.own[i] = max(now.uncertainty[i] - estimate.common[i], now.variance[i])
         for a in range(3):
             now.gain[a, i] = subset.gain[i, a] if now.fused >> i & 1 else 0.0
     if subset.spans:

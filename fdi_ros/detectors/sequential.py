@@ -61,6 +61,7 @@ from fdi_ros.estimator.error_states import (
     predict,
     prepare_layout,
     project,
+    shared_variance,
 )
 from fdi_ros.estimator.estimator import (
     BLOCK_TIME,
@@ -368,9 +369,7 @@ def fill_verdict(
         sample.estimate.bias_std[i] = math.sqrt(kf.states.p[i, i])
         sample.estimate.far_bias[i] = kf.far_bias[i]
         sample.estimate.common[i] = kf.bias_error[i] ** 2 + kf.alike_bias[i] ** 2
-        for a in range(3):
-            shared = params.layout.shared_scale * kf.signal_rate[a]
-            sample.estimate.common[i] += (shared * params.sensors.axes[i, a]) ** 2
+        sample.estimate.common[i] += shared_variance(params.layout, kf.at, i)
         for j in range(n):
             # Until the faulty channels are named, each one may have the error that the
             # hypotheses give it.

@@ -203,6 +203,18 @@ def begin_states(layout: Layout, states: ErrorStates, bias_std: Array) -> None:
 
 
 @compiled
+def shared_variance(layout: Layout, at: Projection, i: int) -> float:
+    """Return the variance of channel i by scale errors that all channels share, (rad/s)^2."""
+    variance = 0.0
+    for signal in range(SIGNALS):
+        axis = layout.by[signal] - RATE_X
+        if 0 <= axis < 3:
+            scale = layout.shared_scale * layout.axes[i, axis]
+            variance += (scale * at.signals[i, signal]) ** 2
+    return variance
+
+
+@compiled
 def add_shared_scale(layout: Layout, states: ErrorStates) -> None:
     """Add the covariance of scale errors, one for each axis of the body, that all channels share."""
     variance = layout.shared_scale * layout.shared_scale

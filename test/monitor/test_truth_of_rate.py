@@ -316,3 +316,21 @@ def test_a_shared_scale_error_changes_nothing_at_rest_and_hides_no_fault():
     assert allowed.state[-1, 4] == ChannelState.FAULTY
     np.testing.assert_allclose(allowed.covariance[:290], plain.covariance[:290], 1e-4)
     assert (allowed.covariance[580, 0, 0] > plain.covariance[580, 0, 0]).all()
+
+
+def test_a_shared_scale_error_leaves_weights_where_all_gyros_reach_their_range():
+    """Gyros are silent beyond 4 rad/s, and the last motion known is another one."""
+    given = {
+        "detector__name": "sequential",
+        "health__max_rate": [4.0],
+        "noise__scale_std": 5e-5,
+        "noise__shared_scale_std": 0.05,
+    }
+    time = np.arange(round(20.0 * RATE)) / RATE
+    rate = 3.0 * swung(time)
+    z = np.tile(rate, (1, 3)) + np.random.default_rng(1).normal(0.0, SIGMA, (2000, 9))
+    stamp = START + np.round(1e9 * time).astype(np.int64)
+    output = Pipeline(parallel(3, **given)).process(Block(stamp, np.clip(z, -4.5, 4.5)))
+    known = output.valid.astype(bool)
+    assert 0.05 < known.mean() <= 1.0
+    assert np.abs(output.rate[known]).max() < 10.0
