@@ -196,6 +196,8 @@ SHARED_WITHIN = NS // 5  #: Changes within this time share texts, ns.
 MONITOR_SILENT = 3 * NS  #: A monitor without reports for this time is silent, ns.
 #: `NOTHING_SEEN` is announced after this time, ns: a late unit ends sooner.
 NOTHING_SEEN_FOR = 2 * NS
+#: Good news wait for this time, ns: sets of a loose unit come and go.
+GOOD_FOR = 2 * NS
 GRAVE = 0.03  #: ArduCopter flies with a smaller error of a gyro, rad/s.
 #: Raw rates of healthy gyros, in whole mrad/s and averaged, differ by less, rad/s.
 ROUNDED = 0.005
@@ -263,6 +265,7 @@ class Announcer:
         }
         """State and set of each channel, and the trouble of the whole. Empty: none."""
         self._said = dict(self._now)  # the same as last announced
+        self._good_since = dict.fromkeys(self._now, 0)  # when each became OK, ns
         self._apart = dict.fromkeys(channels, "")
         """Present difference of each channel and the other of its pair, rad/s."""
         # Estimated, rad/s, of an accelerometer m/s^2.
@@ -304,6 +307,7 @@ class Announcer:
     def _note(self, name: str, found: tuple[str, str], now: int) -> None:
         if found != self._now[name]:
             self._now[name] = found
+            self._good_since[name] = now
             self._changed = now if self._changed is None else self._changed
 
     def due(self, now: int) -> list[tuple[int, str]]:
@@ -315,7 +319,7 @@ class Announcer:
         if self._changed is not None and now - self._changed < SHARED_WITHIN:
             return []
         self._changed = None
-        alike = self._alike()
+        alike = self._alike(now)
         if self._raw_apart is not None:
             quiet = [names for names in alike if self._now[names[0]][0] in _QUIET]
             self._said |= {name: self._now[name] for names in quiet for name in names}
@@ -342,10 +346,17 @@ class Announcer:
         error = max(map(self._errors.__getitem__, names))
         return self._raw_apart(unit) < min(GRAVE, max(ROUNDED, error / 2))
 
-    def _alike(self) -> list[tuple[str, ...]]:
+    def _alike(self, now: int) -> list[tuple[str, ...]]:
         """Return the changed channels in groups that share a text: a set, or a whole unit."""
-        left = {name: now for name, now in self._now.items() if now != self._said[name]}
-        groups = dict.fromkeys(now for now in left.values() if now[0] == "AMBIGUOUS")
+        left = {
+            name: found
+            for name, found in self._now.items()
+            if found != self._said[name]
+            and (found[0] != "OK" or now - self._good_since[name] >= GOOD_FOR)
+        }
+        groups = dict.fromkeys(
+            found for found in left.values() if found[0] == "AMBIGUOUS"
+        )
         found = [
             tuple(name for name in left if left[name] == group) for group in groups
         ]

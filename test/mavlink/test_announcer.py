@@ -80,7 +80,7 @@ def test_an_accelerometer_is_named_with_its_size_and_stays_a_warning(apart) -> N
     assert ground.hear(force(name, "FAULTY", "-1.234")) == [(WARNING, text)]
     assert ground.hear(force(name, "FAULTY", "-1.6")) == []
     again = [] if apart else [(INFO, "FDI: accelerometer z of IMU 2 agrees again")]
-    assert ground.hear(force(name, "OK")) == again
+    assert ground.hear(force(name, "OK"), wait=3.0) == again
     unknown = [(WARNING, "FDI: accelerometer z of IMU 2 faulty")]
     assert ground.hear(force(name, "FAULTY")) == unknown
     assert len("FDI: accelerometer z of IMU 4 off by 156.9 m/s^2") <= TEXT_LENGTH
@@ -116,7 +116,7 @@ def test_a_fault_of_a_unit_in_gyros_and_accelerometers_is_one_text(
     assert ground.hear(*gyros, *forces) == [(severity, text)]
     good = [report(f"imu_2.{axis}", "OK") for axis in "xyz"]
     well = [force(f"imu_2.accel_{axis}", "OK") for axis in "xyz"]
-    assert ground.hear(*good, *well) == [(INFO, "FDI: imu_2 agrees again")]
+    assert ground.hear(*good, *well, wait=3.0) == [(INFO, "FDI: imu_2 agrees again")]
 
 
 def test_a_single_accelerometer_or_one_of_another_unit_is_a_text_of_its_own() -> None:
@@ -147,13 +147,25 @@ def test_declarations_are_told_and_suspicions_are_not() -> None:
         (CRITICAL, "FDI: imu_2.y faulty")
     ]
     assert ground.hear(report("imu_2.y", "FAULTY")) == []
-    assert ground.hear(report("imu_2.y", "OK")) == [(INFO, "FDI: imu_2.y agrees again")]
+    good = [(INFO, "FDI: imu_2.y agrees again")]
+    assert ground.hear(report("imu_2.y", "OK"), wait=3.0) == good
     assert (
         ground.hear(
             report("another.channel", "FAULTY"), report("imu_1.x", "no such state")
         )
         == []
     )
+
+
+def test_a_set_that_comes_and_goes_is_told_once() -> None:
+    """As that of a unit with a loose mounting. Good news wait for 2 s."""
+    ground = Ground()
+    group = ", ".join(CHANNELS[3:6])
+    bad = [report(name, "AMBIGUOUS", group) for name in CHANNELS[3:6]]
+    good = [report(name, "OK") for name in CHANNELS[3:6]]
+    told = [text for _ in range(5) for text in ground.hear(*bad) + ground.hear(*good)]
+    assert len(told) == 1
+    assert ground.hear(*good, wait=3.0) == [(INFO, "FDI: imu_2 agrees again")]
 
 
 def test_a_frozen_unit_is_told_by_its_name_until_it_is_declared() -> None:
@@ -164,7 +176,8 @@ def test_a_frozen_unit_is_told_by_its_name_until_it_is_declared() -> None:
 
     assert ground.hear(*reports("OK", "0.25")) == [(WARNING, "FDI: imu_2 frozen")]
     assert ground.hear(*reports("OK", "1.25")) == []
-    assert ground.hear(*reports("OK", "")) == [(INFO, "FDI: imu_2 agrees again")]
+    good = [(INFO, "FDI: imu_2 agrees again")]
+    assert ground.hear(*reports("OK", ""), wait=3.0) == good
     assert ground.hear(*reports("FAULTY", "2.25")) == [(CRITICAL, "FDI: imu_2 faulty")]
 
 
