@@ -14,8 +14,15 @@ stands in a set, flights without a fault; nees: e' P^-1 e / 3 of the fused rate 
 level: share of samples beyond the protection level; no_rate: share of samples without a rate.
 t_002, t_01, t_03: s from the onset of the fault until its channel stands alone (with two parallel units: with its
 twin), median. missed: flights with a fault that is not named.
-unit: of conditions with a faulty unit, s until declared channels are all of that unit (with two units: until its
-channels are all declared), median; episodes: how often a declaration begins anew after the onset, mean.
+
+Conditions with a faulty unit; an axis is affected if its error ever reaches ten standard deviations of the noise:
+touched: s from the onset to the first sample in which all declared channels are of that unit, also if it is one axis
+for one sample (with two units: all affected axes), median. unit: s from the onset until the unit stands, median. It
+stands if for a second without a break all affected axes are declared (FAULTY or in a set) and no channel of another
+unit is; with two units a channel of the other one may be in the set. in_2_s: flights in which it stands within 2 s of
+the time at which the last of the affected axes has shown its error. held: share of the time from then on in which the
+unit is declared like that, mean; 0 where it never stands. episodes, most: episodes that a replay tells from the onset
+on, mean and largest number.
 """
 
 from __future__ import annotations
@@ -33,12 +40,19 @@ from vibration import BIAS, COUNTED, MISALIGNMENT, SCALE
 from fdi_ros import Block, Config, Pipeline
 from fdi_ros.experiments.flight import regular_stamps
 from fdi_ros.monitor.output import ChannelState, Output
+from fdi_ros.replay.episodes import Story
+from fdi_ros.replay.recorder import Recorder
 
 MOUNTINGS = ("cone", "2 units", "3 units", "4 units")
 RATES = (100.0, 50.0, 400.0)  # samples a second
 SIZES = {"t_002": 0.02, "t_01": 0.1, "t_03": 0.3}  # of faults, rad/s
 ONSET = 0.6  # of a fault, share of the flight
 GRAVITY = 9.81  # m/s^2
+SHOWN = 10 * NOISE  # error of an axis that is affected, rad/s
+STANDS, SOON = (
+    1.0,
+    2.0,
+)  # s without a break until a unit stands, and after which it is late
 FIGURES = {
     "flights": "d",
     "wrong": "d",
@@ -49,8 +63,12 @@ FIGURES = {
     "no_rate": ".1%",
     **dict.fromkeys(SIZES, ".2f"),
     "missed": "d",
+    "touched": ".2f",
     "unit": ".2f",
+    "in_2_s": "d",
+    "held": ".0%",
     "episodes": ".1f",
+    "most": "d",
 }
 
 
@@ -63,9 +81,12 @@ class Flight(vibration.Flight):
     steps: list[Callable[[Array], Array]] = field(default_factory=list)
     """What the electronics make of the values (N, n), in turn."""
     lost: Array = field(default_factory=lambda: np.empty(0))  # channels silent (n,)
+    off: Array = field(default_factory=lambda: np.empty(0))
+    """By how much a faulty unit is off (N, n), rad/s; known with the values."""
 
     def __post_init__(self) -> None:
         self.lost = np.zeros(len(self.axes), bool)
+        self.off = np.zeros((len(self.t), len(self.axes)))
 
     @property
     def length(self) -> float:
@@ -264,7 +285,9 @@ def unit_turned(flight: Flight, matrix: Any) -> None:
 
     def turned(z: Array) -> Array:
         after = flight.t >= flight.onset
-        z[after, own] = z[after, own] @ matrix.T
+        wrong = z[after, own] @ matrix.T
+        flight.off[after, own] = wrong - z[after, own]
+        z[after, own] = wrong
         return z
 
     flight.steps.append(turned)
@@ -279,7 +302,8 @@ def unit_offset(flight: Flight) -> None:
     """Add a constant offset to all axes of a unit."""
     own = flight.a_unit()
     offset = np.array([0.5, -0.3, 0.2])
-    flight.noise[:, own] += (flight.t >= flight.onset)[:, None] * offset
+    flight.off[:, own] = (flight.t >= flight.onset)[:, None] * offset
+    flight.noise += flight.off
 
 
 def unit_loose(flight: Flight, hertz: float, size: float) -> None:
@@ -289,7 +313,8 @@ def unit_loose(flight: Flight, hertz: float, size: float) -> None:
     axis /= np.linalg.norm(axis)
     since = np.maximum(flight.t - flight.onset, 0.0)
     swing = size * np.sin(2 * np.pi * hertz * since)[:, None] * axis
-    flight.noise[:, own] += swing @ flight.axes[own].T
+    flight.off[:, own] = swing @ flight.axes[own].T
+    flight.noise += flight.off
 
 
 SWAPPED = ((0, 1, 0), (1, 0, 0), (0, 0, 1))
@@ -387,8 +412,17 @@ class Flown(NamedTuple):
     level: float
     no_rate: float
     named: float  # s until the fault of a channel is named
-    unit: float  # s until the unit is
-    episodes: float
+    whole: Whole | None  # of a faulty unit
+
+
+class Whole(NamedTuple):
+    """Figures of a unit that is wrong as a whole."""
+
+    touched: float  # s until nothing but channels of the unit is declared
+    unit: float  # s until the unit stands
+    soon: bool  # within SOON of the time from which all affected axes have shown their error
+    held: float
+    episodes: int
 
 
 def measure(asked: Asked) -> Iterator[Row]:
@@ -425,9 +459,17 @@ def figures_of(
         "worst": max(nees, default=np.nan),
         "level": np.mean([one.level for one in healthy]),
         "no_rate": np.mean([one.no_rate for one in healthy]),
-        "unit": np.median([one.unit for one in healthy]),
-        "episodes": np.mean([one.episodes for one in healthy]),
     }
+    if whole := [one.whole for one in healthy if one.whole is not None]:
+        told = [one.episodes for one in whole]
+        figures |= {
+            "touched": np.median([one.touched for one in whole]),
+            "unit": np.median([one.unit for one in whole]),
+            "in_2_s": sum(one.soon for one in whole),
+            "held": np.mean([one.held for one in whole]),
+            "episodes": np.mean(told),
+            "most": max(told),
+        }
     biased = condition.biased and pipeline.geometry.n // 3 >= condition.judged
     named = np.array([one.named for one in healthy if not biased])
     for column, size in SIZES.items() if biased else ():
@@ -459,10 +501,12 @@ def fly(pipeline: Pipeline, mounting: str, name: str, size: float, rng: Rng) -> 
         )
     stamps = regular_stamps(condition.length, flight.rate, START)[: len(flight.t)]
     output = fresh(pipeline, Block(stamps, flight.values()))
-    return judged(flight, output, mounting)
+    recorder = Recorder(pipeline.geometry, pipeline.noise)
+    recorder.add(flight.t, output)
+    return judged(flight, output, mounting, recorder.story())
 
 
-def judged(flight: Flight, output: Output, mounting: str) -> Flown:
+def judged(flight: Flight, output: Output, mounting: str, story: Story) -> Flown:
     """Compare what was said with what happened."""
     truth = flight.truth_at((output.instant - START) * 1e-9)
     counted = flight.t >= COUNTED
@@ -477,20 +521,14 @@ def judged(flight: Flight, output: Output, mounting: str) -> Flown:
     guilty = np.zeros(faulty.shape, bool)
     guilty[:, list(flight.culprits)] = (flight.t >= flight.onset)[:, None]
     after = flight.t >= flight.onset
-    named = unit = episodes = np.nan
+    named, whole = np.nan, None
     if len(flight.culprits) == 1:
         twins = mounting != "cone" and (~flight.lost).sum() == 6
         own = (declared if twins else faulty)[:, flight.culprits[0]]
         alone = declared.sum(axis=1) <= (2 if twins else 1)
         named = first((own & alone)[after]) / flight.rate
     elif flight.culprits:
-        inside = declared.any(axis=1) & ~(declared & ~guilty).any(axis=1)
-        if flight.units == 2:
-            inside = declared[:, list(flight.culprits)].all(axis=1)
-        unit = first(inside[after]) / flight.rate
-    if flight.culprits:
-        any_declared = declared.any(axis=1)[after]
-        episodes = float((any_declared[1:] & ~any_declared[:-1]).sum())
+        whole = whole_of(flight, faulty, declared, story)
     return Flown(
         wrong=bool((faulty & ~guilty).any()),
         sets=float((among & ~guilty).any(axis=1).mean()),
@@ -500,6 +538,33 @@ def judged(flight: Flight, output: Output, mounting: str) -> Flown:
         else 0.0,
         no_rate=float(1.0 - rows.sum() / counted.sum()),
         named=float(named),
-        unit=float(unit),
-        episodes=episodes,
+        whole=whole,
+    )
+
+
+def whole_of(flight: Flight, faulty: Array, declared: Array, story: Story) -> Whole:
+    """Return how a faulty unit is told; channels (N, n) FAULTY, and declared: FAULTY or in a set."""
+    after = flight.t >= flight.onset
+    off = np.abs(flight.off[after]) >= SHOWN
+    affected = off.any(axis=0)
+    all_declared = declared[after][:, affected].all(axis=1)
+    others = np.ones(len(affected), bool)
+    others[list(flight.culprits)] = False
+    # Of two units nobody can say which is wrong, so that the other one may be in the set.
+    blamed = (faulty if flight.units == 2 else declared)[after]
+    others_blamed = blamed[:, others].any(axis=1)
+    complete = all_declared & ~others_blamed
+    inside = complete if flight.units == 2 else declared[after].any(axis=1)
+    lasting = np.lib.stride_tricks.sliding_window_view(
+        complete, round(STANDS * flight.rate)
+    ).all(axis=1)
+    unit = first(lasting)
+    has_shown = np.logical_or.accumulate(off, axis=0)[:, affected].all(axis=1)
+    held = complete[int(unit) :].mean() if np.isfinite(unit) else 0.0
+    return Whole(
+        touched=first(inside & ~others_blamed) / flight.rate,
+        unit=unit / flight.rate,
+        soon=unit <= first(has_shown) + SOON * flight.rate,
+        held=float(held),
+        episodes=sum(one.start_s >= flight.onset for one in story.declared),
     )
