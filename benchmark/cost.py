@@ -8,6 +8,9 @@ receiver; medians, us. Offline: many samples at once, us of CPU time a sample, m
 motion; faults: every ten seconds one channel is off for one second, and declarations are forgiven after half a second;
 noise: twice what the settings say. nine and nine: nine gyros and the nine accelerometers beside them. --trials:
 thousands of samples offline.
+
+The machine may change its speed within a run. So statistic and monitor are timed in turn, some ten milliseconds each:
+times and message_times are medians of the ratios of neighbours, offline of the mean ratio of a run.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from statistics import median
 from typing import Any
 
@@ -39,7 +43,9 @@ FOUR = {
 GRAVITY, SWAY, FORCE_NOISE = 9.81, 2.0, 0.15  # m/s^2
 FORGIVING = {"decision.latch": False, "decision.clean_time": 0.5}
 SITUATIONS = ("calm", "faults", "noise")
-WARM, MEASURED, REPEATS = 3000, 3000, 5  # samples one by one, and runs offline
+WARM, MEASURED, REPEATS = 3000, 6000, 5  # samples one by one, and runs offline
+IN_TURN = 200  # samples one by one before it is the turn of the next
+PIECES = 30  # of a run offline, each beside the statistic
 
 
 def stream(pipeline: Pipeline, asked: Asked, count: int, situation: str) -> Block:
@@ -77,14 +83,20 @@ def messages_of(block: Block, units: range) -> list[list[bytes]]:
     return messages
 
 
-def each(call: Callable[[int], Any], count: int) -> float:
-    """Median time of so many calls, us."""
+def each(call: Callable[[int], Any], samples: range) -> float:
+    """Median time of a call for each of these samples, us."""
     spent = []
-    for k in range(count):
+    for k in samples:
         begun = time.perf_counter_ns()
         call(k)
         spent.append(time.perf_counter_ns() - begun)
     return median(spent) / 1e3
+
+
+def statistic_of(pipeline: Pipeline, block: Block) -> Callable[[int], Any]:
+    """Return the yardstick: the statistic of sample k."""
+    S, z = pipeline.geometry.S, block.z
+    return lambda k: np.abs(S @ z[k]).argmax()
 
 
 def one_by_one(config: Config, asked: Asked) -> dict[str, float]:
@@ -92,7 +104,7 @@ def one_by_one(config: Config, asked: Asked) -> dict[str, float]:
     pipeline = Pipeline.from_config(config)
     block = stream(pipeline, asked, WARM + MEASURED, "calm")
     pipeline.process(block[:WARM])
-    S, z = pipeline.geometry.S, block.z
+    statistic = statistic_of(pipeline, block)
     receiver = Receiver(Pipeline.from_config(config))
     messages = messages_of(block, range(pipeline.geometry.n // 3))
 
@@ -106,23 +118,37 @@ def one_by_one(config: Config, asked: Asked) -> dict[str, float]:
 
     for k in range(WARM):
         take(k)
-    statistic = each(lambda k: np.abs(S @ z[k]).argmax(), MEASURED)
-    sample = each(lambda k: pipeline.process(block[WARM + k : WARM + k + 1]), MEASURED)
-    received = each(lambda k: take(WARM + k), MEASURED)
-    ratios = {"times": sample / statistic, "message_times": received / statistic}
-    return {"statistic": statistic, "sample": sample, "messages": received, **ratios}
+    calls = (statistic, lambda k: pipeline.process(block[k : k + 1]), take)
+    turns = [
+        [each(call, range(begin, begin + IN_TURN)) for call in calls]
+        for begin in range(WARM, WARM + MEASURED, IN_TURN)
+    ]
+    spent = np.array(turns)
+    names = ("statistic", "sample", "messages")
+    figures = dict(zip(names, np.median(spent, axis=0).tolist(), strict=True))
+    times, message_times = np.median(spent[:, 1:] / spent[:, :1], axis=0).tolist()
+    return {**figures, "times": times, "message_times": message_times}
 
 
-def offline(pipeline: Pipeline, block: Block) -> float:
-    """Time a whole stream, us a sample."""
-    spent = []
-    for _ in range(REPEATS):
+def offline(pipeline: Pipeline, block: Block) -> dict[str, float]:
+    """Time a whole stream in pieces, each beside the statistic."""
+    statistic = statistic_of(pipeline, block)
+    edges = np.linspace(10, len(block), PIECES + 1).astype(int).tolist()
+    spent = np.empty((REPEATS, PIECES, 2))
+    for run in spent:
         pipeline.restart()
         pipeline.process(block[:10])
-        begun = time.thread_time()
-        pipeline.process(block[10:])
-        spent.append(time.thread_time() - begun)
-    return 1e6 * median(spent) / len(block)
+        for turn, (begin, end) in zip(run, pairwise(edges), strict=True):
+            turn[0] = each(statistic, range(begin, begin + IN_TURN))
+            begun = time.thread_time()
+            pipeline.process(block[begin:end])
+            turn[1] = 1e6 * (time.thread_time() - begun) / (end - begin)
+    ratios = spent[..., 1] / spent[..., 0]
+    return {
+        "statistic": float(np.median(spent[..., 0])),
+        "sample": float(np.median(spent[..., 1].mean(axis=1))),
+        "times": float(np.median(ratios.mean(axis=1))),
+    }
 
 
 def measure(asked: Asked) -> Iterator[Row]:
@@ -136,21 +162,12 @@ def measure(asked: Asked) -> Iterator[Row]:
     for mounting, config in configs.items():
         if not asked.wants(mounting):
             continue
-        single = one_by_one(config, asked)
-        yield f"{mounting}, one by one", single
+        yield f"{mounting}, one by one", one_by_one(config, asked)
         for rate in (100.0, 1000.0):
             pipeline = Pipeline.from_config(
                 config.replaced({**FORGIVING, "sample_rate": rate})
             )
             for situation in SITUATIONS:
-                spent = offline(
-                    pipeline,
-                    stream(pipeline, asked, 1000 * asked.count(300), situation),
-                )
-                yield (
-                    f"{mounting}, offline, {rate:g} Hz, {situation}",
-                    {
-                        "sample": spent,
-                        "times": spent / single["statistic"],
-                    },
-                )
+                block = stream(pipeline, asked, 1000 * asked.count(300), situation)
+                label = f"{mounting}, offline, {rate:g} Hz, {situation}"
+                yield label, offline(pipeline, block)
