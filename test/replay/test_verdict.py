@@ -14,6 +14,7 @@ from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fdi_ros.config.config import Config
 from fdi_ros.config.unit_names import short_names, unit_names
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.inspection.values import Values
@@ -42,6 +43,9 @@ TRIADS = Geometry.from_triads([np.eye(3)] * 3)
 
 needs_cases = pytest.mark.skipif(
     not CASES.is_dir(), reason="../shared/data/cases is not there"
+)
+needs_sitl = pytest.mark.skipif(
+    not SITL.is_dir(), reason="../shared/data/sitl is not there"
 )
 
 
@@ -589,7 +593,37 @@ def test_a_verdict_that_is_not_clear_says_what_to_do(word, fdi, tmp_path):
     assert first.endswith(f" What to do: {what}.")
 
 
-@pytest.mark.skipif(not SITL.is_dir(), reason="../shared/data/sitl is not there")
+BIASES = {
+    105.0: "imu_3.z",
+    129.2: "imu_2.y",
+    153.3: "imu_2.z",
+    177.4: "imu_3.x",
+    201.5: "imu_1.y",
+    225.5: "imu_2.x",
+    249.5: "imu_3.y",
+    273.6: "imu_1.z",
+    297.7: "imu_2.x",
+    321.9: "imu_1.x",
+}
+"""Onset, s from the first message, and channel of the simulated biases of 0.01 to 0.3 rad/s."""
+
+
+@needs_sitl
+def test_ten_biases_of_one_flight_are_named_and_no_other_channel():
+    # A log has topics without /data_raw, and this one half the rate that the node asks for.
+    topics = tuple(f"imu_{k}" for k in (1, 2, 3))
+    changes = {"imus.topics": topics, "sample_rate": 25.0}
+    config = Config.from_file(ROOT / "config" / "ardupilot.yaml", changes)
+    story = replay(SITL / "biases.tlog", config).story
+    named = [one.channels for one in story.episodes if one.state == "FAULTY"]
+    assert named == [(channel,) for channel in BIASES.values()]
+    assert len(story.episodes) == len(BIASES)
+    for one, onset in zip(story.episodes, BIASES, strict=True):
+        assert 0.0 <= one.since_s - onset < 3.0
+        assert all(step.state != "FAULTY" for step in one.steps[:-1])
+
+
+@needs_sitl
 def test_a_log_in_which_all_values_repeat_for_long_is_not_healthy():
     result = replay(SITL / "calm.tlog", end=60.0)
     assert result.verdict.word == "CANNOT TELL"
