@@ -46,7 +46,9 @@ def flown(mounting, name, **settings):
 )
 def test_the_covariance_is_true_without_redundancy(mounting, name):
     found = flown(mounting, name)
-    assert 0.2 < found["nees"].mean() < 2.0, found
+    # With two units left there is a check, and less to allow for.
+    checked = mounting == "3 units" and name != "one unit ever"
+    assert (0.5 if checked else 0.3) < found["nees"].mean() < 2.0, found
     assert found["nees"].max() < 3.0, found
     assert not found["wrong"].any()
     assert not found["no_rate"].any()
@@ -55,7 +57,7 @@ def test_the_covariance_is_true_without_redundancy(mounting, name):
 @pytest.mark.parametrize("mounting", ["cone", "3 units"])
 def test_a_bias_that_was_never_learned_is_in_the_covariance(mounting):
     found = flown(mounting, "one unit ever", bias__startup_bias_duration=0.0)
-    assert 0.1 < found["nees"].mean() < 2.0, found
+    assert 0.2 < found["nees"].mean() < 2.0, found
 
 
 @pytest.mark.parametrize(

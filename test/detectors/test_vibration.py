@@ -34,27 +34,32 @@ def flown(units, name):
     return {key: np.array([flight[key] for flight in flights]) for key in flights[0]}
 
 
+LEAST = {
+    "white": 0.6,
+    "unit 1 late by 20 ms": 0.28,
+    "unit 2 late by 20 ms": 0.28,
+    "own tones 0.03 43.0 Hz at 100": 0.25,
+    "own tones 0.1 12.7 Hz at 100": 0.2,
+    "body 0.1 43.0 Hz at 100": 0.05,
+    "body 0.03 149.0 Hz at 50": 0.3,
+    "body broadband 0.05": 0.05,
+    "AR 0.9": 0.6,
+    "low pass 30 Hz at 400": 0.45,
+    "clocks 50 ppm": 0.5,
+    "landing shock 5 rad/s": 0.4,
+}
+"""Least NEES / 3 of two flights, below those of twelve such pairs with two to four units.
+
+A covariance that is too large is of no use either. Where the whole body shakes, NEES differs much
+from flight to flight.
+"""
+
+
 @pytest.mark.parametrize("units", [2, 4])
-@pytest.mark.parametrize(
-    "name",
-    [
-        "white",
-        "unit 1 late by 20 ms",
-        "unit 2 late by 20 ms",
-        "own tones 0.03 43.0 Hz at 100",
-        "own tones 0.1 12.7 Hz at 100",
-        "body 0.1 43.0 Hz at 100",
-        "body 0.03 149.0 Hz at 50",
-        "body broadband 0.05",
-        "AR 0.9",
-        "low pass 30 Hz at 400",
-        "clocks 50 ppm",
-        "landing shock 5 rad/s",
-    ],
-)
+@pytest.mark.parametrize("name", LEAST)
 def test_the_covariance_is_true(units, name):
     found = flown(units, name)
-    assert 0.05 < found["nees"].mean() < 2.0, found
+    assert LEAST[name] < found["nees"].mean() < 2.0, found
     assert found["nees"].max() < 5.0, found
     assert found["level"].max() < 0.005, found
     assert not found["faulty"].any(), found
@@ -72,7 +77,7 @@ def test_biases_that_all_move_are_followed(units):
     """As motors start, or while all gyros warm up: stated, and no set that stands for the flight."""
     for name in ("rectified 5 mrad/s", "warming 20 mrad/s"):
         found = flown(units, name)
-        assert found["nees"].mean() < 3.0, found
+        assert 0.2 < found["nees"].mean() < 3.0, found
         assert found["ok"].mean() > 0.8, found
 
 
@@ -111,5 +116,5 @@ def test_vibration_near_the_sample_rate_is_no_delay(seed):
     error = (output.rate - rate_at(t + (output.instant - output.stamp) * 1e-9))[900:]
     covariance = output.covariance[900:]
     weighed = np.linalg.solve(covariance, error[..., None])[..., 0]
-    assert 0.05 < (error * weighed).sum(axis=1).mean() / 3.0 < 2.0
+    assert 0.1 < (error * weighed).sum(axis=1).mean() / 3.0 < 2.0
     assert not any(event.declares for event in output.events)
