@@ -81,3 +81,19 @@ def test_no_healthy_gyro_is_named_where_no_fault_of_one_explains(name, size, see
         else:
             assert flight.whole.touched < 1.0, seed
             assert flight.whole.soon, seed
+
+
+@pytest.mark.parametrize(
+    "name", ["unit x0.5", "unit x8.0", "unit swapped", "unit mirrored", "unit offset"]
+)
+def test_a_unit_that_is_wrong_as_a_whole_stands_in_time(name):
+    """All its affected axes are declared and stay so, and the replay tells few episodes."""
+    pipeline = Pipeline.from_config(config_of("3 units", 100.0, {}, Asked()))
+    flights = [
+        fly(pipeline, "3 units", name, 0.0, np.random.default_rng([k, 7]))
+        for k in range(FLIGHTS)
+    ]
+    assert not any(flight.wrong for flight in flights)
+    assert all(flight.whole.soon for flight in flights)
+    assert all(flight.whole.held > 0.9 for flight in flights)
+    assert all(1 <= flight.whole.episodes <= 3 for flight in flights)
