@@ -107,7 +107,8 @@ def source(rate: float, seconds: float) -> None:
     ]
     while not all(output.get_subscription_count() for output in outputs):
         time.sleep(0.05)
-    time.sleep(0.5)
+    print("ready", flush=True)
+    sys.stdin.readline()
     template, nothing = ImuTemplate("imu"), (0.0,) * 9
     rng = np.random.default_rng(0)
     values = rng.normal(0, 0.003, (5000, 2, 3)).tolist()
@@ -159,6 +160,9 @@ def sink(file: str) -> None:
     )
     executor = EventsExecutor()
     executor.add_node(node)
+    while not stop and not node.count_publishers("fused"):
+        executor.spin_once(timeout_sec=0.1)
+    print("ready", flush=True)
     while not stop:
         executor.spin_once(timeout_sec=0.1)
     stamps = [struct.unpack_from("<iI", head, 4) for _, head in arrived]
@@ -178,8 +182,7 @@ def cpu_seconds(pid: int) -> float:
 
 
 def settled(pid: int) -> float:
-    """Wait until a process has started, which takes most of a core; return its CPU time, s."""
-    time.sleep(1.5)
+    """Wait until a process waits for messages; return its CPU time, s. Starting takes most of a core."""
     spent = cpu_seconds(pid)
     for _ in range(60):
         time.sleep(1.0)
@@ -197,17 +200,24 @@ def measure(candidate: str, rate: float, seconds: float) -> Run:
         node = subprocess.Popen(
             [sys.executable, *CANDIDATES[candidate]], cwd=ROOT, **quiet
         )
-        listener = subprocess.Popen([sys.executable, __file__, "sink", file])
+        listener = subprocess.Popen(
+            [sys.executable, __file__, "sink", file], stdout=subprocess.PIPE, text=True
+        )
+        words = [sys.executable, __file__, "source", str(rate), str(seconds)]
+        sender = subprocess.Popen(
+            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
         try:
+            for process in (listener, sender):
+                assert process.stdout is not None
+                process.stdout.readline()
             before = settled(node.pid)
             begin = time.perf_counter()
-            words = [sys.executable, __file__, "source", str(rate), str(seconds)]
-            said = subprocess.run(
-                words, capture_output=True, text=True, check=True, timeout=60 + seconds
-            ).stdout
+            said, _ = sender.communicate("go\n", timeout=60 + seconds)
             used = cpu_seconds(node.pid) - before
             time.sleep(0.5)
         finally:
+            sender.kill()
             for process in (node, listener):
                 process.send_signal(signal.SIGINT)
                 process.wait(10)
