@@ -69,7 +69,7 @@ SHOWN = 2.0
 SAME_TURN = 0.8
 TINY = 1e-3  #: Resolution of the messages, rad/s.
 #: An axis moves if its mean rate and that of another IMU change alike, by this or more, rad/s, and
-#: by so many standard deviations of noise, or are alike and `TURN_RATE` or more.
+#: by so many standard deviations of noise. A steady rate is no motion: both axes may be stuck at it.
 MOVES = 0.005
 MOVES_SIGMAS = 4.0
 MOVES_WITHIN = NS  #: Longest time of that change, ns.
@@ -95,9 +95,6 @@ STATES = {int(state): state for state in ChannelState}
 UNJUDGED = {ChannelState.UNCHECKED, ChannelState.EXCLUDED, ChannelState.STALE}
 JUDGED = set(ChannelState) - UNJUDGED
 KNOWN_SIGMAS = 5.0  #: Standard deviations from which a size is known.
-#: A frozen IMU is known only once others have turned. One that agreed with it this long before, ns,
-#: did so until it froze.
-FREEZES = NS // 2
 SILENCE = NS // 2  #: An IMU without samples for this time does not deliver, ns.
 STATES_KNOWN_FOR = 5 * NS  #: Older states of the monitor are unknown, ns.
 #: An axis counts as judged for this time after the monitor last judged it, ns: it leaves all
@@ -185,8 +182,6 @@ class Track:
     #: Axes that were apart from all others since it was last trusted. A gyro that has lost its
     #: scale agrees with another bad one at some rate, so these are not proven.
     off: set[int] = field(default_factory=set)
-    #: IMUs that agreed with it until it froze. None: it does not repeat one value.
-    survivors: set[int] | None = None
 
     @property
     def is_ok(self) -> bool:
@@ -216,13 +211,6 @@ def _worst(sizes: Vector, blamed: set[int]) -> str:
     """Return the axis that is off most, if it is blamed."""
     axis = max(range(3), key=sizes.__getitem__)
     return AXES[axis] if axis in blamed else ""
-
-
-def _are_alike(pair: Sequence[float], least: float) -> bool:
-    """Return whether two values are at least this large, and differ by no more than the smaller."""
-    one, other = pair
-    smaller = abs(nearest_zero(pair))
-    return smaller >= least and abs(one - other) <= smaller
 
 
 def _note_sizes(track: Track, agreed: int | None, share: float, now: int) -> None:
@@ -287,7 +275,6 @@ class Evidence:
         # Each pair of IMUs, in either order, and when it was last known, ns.
         self._pairs: dict[tuple[int, int], Compared] = {}
         self._known_at: dict[tuple[int, int], int] = {}
-        self._alike_at: dict[tuple[int, int], int] = {}  # when they last agreed, ns
         # The smallest steady difference of each at the last look, rad/s.
         self._steady: dict[tuple[int, int], Vector] = {}
         self._tracks = [Track() for _ in range(count)]
@@ -362,7 +349,6 @@ class Evidence:
         }
         self._compare(units, now)
         self._note_moves(units, now)
-        self._note_frozen(units, now)
         self._note_trust(units, now)
         odd, accused = self._lasting_odd_one(units, now)
         for k, track in enumerate(self._tracks):
@@ -438,18 +424,10 @@ class Evidence:
         return found._replace(
             ok=track.is_ok and is_fine,
             stuck=stuck,
-            survives=self._survives(unit),
             size=max(track.sizes),
             votes=unit not in self._once_bad,
             waits="".join(AXES[axis] for axis in sorted(track.waits)),
             unjudged="".join(unjudged),
-        )
-
-    def _survives(self, unit: int) -> bool:
-        """Return whether an IMU that is not doubted agreed with another until that froze."""
-        is_doubted = bool(self._tracks[unit].doubts)
-        return not is_doubted and any(
-            unit in (track.survivors or ()) for track in self._tracks
         )
 
     def _lasting_odd_one(self, units: Sequence[int], now: int) -> tuple[int, set[int]]:
@@ -488,7 +466,7 @@ class Evidence:
             self._pairs[j, k] = self._pairs[k, j] = found
 
     def _note_moves(self, units: Sequence[int], now: int) -> None:
-        """Note which axes change, or turn, as those of another IMU do."""
+        """Note which axes move as those of another IMU do."""
         turns = {k: self.raw.motion(k).mean for k in units}
         if now - self._turned_at >= MOVES_WITHIN:
             self._turned_at = now
@@ -496,29 +474,16 @@ class Evidence:
         for pair in combinations(turns.keys() & self._turns.keys(), 2):
             noise = self.raw.noise(*pair)
             for axis in range(3):
-                least = max(MOVES, MOVES_SIGMAS * noise[axis])
-                rates = [turns[k][axis] for k in pair]
-                changes = [turns[k][axis] - self._turns[k][axis] for k in pair]
-                if _are_alike(changes, least) or _are_alike(rates, TURN_RATE):
+                needed = max(MOVES, MOVES_SIGMAS * noise[axis])
+                one, other = (turns[k][axis] - self._turns[k][axis] for k in pair)
+                least = abs(nearest_zero((one, other)))
+                if least >= needed and abs(one - other) <= least:
                     for k in pair:
                         self._tracks[k].moved_at[axis] = self._turned_at
         for track in self._tracks:
             track.moves = {
                 axis for axis, at in enumerate(track.moved_at) if now - at < MOVED_FOR
             }
-
-    def _note_frozen(self, units: Sequence[int], now: int) -> None:
-        """Note which IMUs agreed with a frozen one until it froze."""
-        for pair in combinations(units, 2):
-            if max(self._pairs[pair].apart) < self._min_size:
-                self._alike_at[pair] = now
-        for k, track in enumerate(self._tracks):
-            if not self.raw.repeats(k, self.raw.fewest):
-                track.survivors = None
-            elif track.survivors is None and self.raw.is_stuck(k):
-                pairs = [pair for pair in self._alike_at if k in pair]
-                recent = [p for p in pairs if now - self._alike_at[p] <= FREEZES]
-                track.survivors = {j for pair in recent for j in pair} - {k}
 
     def _note_trust(self, units: Sequence[int], now: int) -> None:
         """Note whether all IMUs agree, and which are apart from all others."""
@@ -718,15 +683,14 @@ class Evidence:
         others that are wrong, or each by less than ``min_size``: its name must have come with this
         difference, which is `VOTE` times as large, and the monitor must not doubt that axis of
         those that it is compared with. One of these must move. While all others are out of use,
-        all that counts is whether the last one is better. One that froze is bad in any case, if
-        another one agreed with it until then.
+        all that counts is whether the last one is better.
         """
         track = self._tracks[unit]
         sure = self._odd_axes(unit, units) if track.partners.are_fit else axes
         blamed = set()
         for axis in axes:
             least = self._min_size
-            if axis not in sure and not track.survivors:
+            if axis not in sure:
                 least *= VOTE
                 others = [self._tracks[k] for k in track.partners.on[axis]]
                 is_doubted = any(axis in other.axes(*DOUBTS) for other in others)

@@ -12,28 +12,24 @@ Definitions
     apart    on an axis: raw rate differs by ``min_size`` or more, and more than scales explain,
              from the nearest IMU that is in use, trusted, or proven on this axis. The errors of
              both may add up
-    moves    on an axis: within 5 s its rate has changed as that of another IMU has, by more than
-             noise explains, or both turn alike by 0.1 rad/s or more
-    frozen   repeats one value while others move. Another IMU survives it that agreed with it
-             until then, and that the monitor does not doubt
+    moves    on an axis: within 5 s its rate has changed as that of another IMU has, and by more than
+             noise explains
     proven   on an axis: it moves, and has done so since the monitor or the raw rates last found it
              bad on a further axis. So it is not dead. It was not apart there
     named    by the monitor, now or in its last report if that is not old, or by the raw
              rates: two of three IMUs agree, and the third is far off
-    blamed   named on an axis that is apart now, and one of three
+    blamed   named on an axis that is apart now, and one of two
              a. outvoted: two others agree on that axis. Each is trusted and moves, or proven,
                 and the monitor does not doubt them
              b. the name came with this difference: it is at most 0.3 s older than twice
                 ``min_size``. The monitor doubts that axis of no IMU that counts there, and
                 one of these moves
-             c. frozen, and another IMU agreed with it until then
     bad      blamed, and delivers. Else left in use.
     alive    delivers samples, and they change while other IMUs turn
     OK       by the monitor on all axes, which has doubted none since the IMU is apart there
     sound    alive, and OK or not apart
     reserve  for a bad IMU: sound. Or alive, OK on the axis on which the bad one is off most, and
-             unchecked on others only because all other IMUs are FAULTY there. For a frozen one
-             also one that is alive and survives it
+             unchecked on others only because all other IMUs are FAULTY there
     trusted  all IMUs have agreed for 2 s since it was last apart. A bad one in use prevents that
     ours     out of use by our order, or perhaps so: from the moment the order is sent
              until the autopilot reports "in use" `SETTLED` after it
@@ -120,8 +116,6 @@ class Imu(NamedTuple):
     fine: str = ""
     delivers: bool = False  #: Its samples arrive.
     stuck: bool = False  #: They repeat one value while another IMU moves.
-    #: Agreed with another IMU until that froze, and the monitor does not doubt it.
-    survives: bool = False
     unjudged: str = (
         ""  #: Axes, such as xz, that the monitor has not judged for a while.
     )
@@ -241,9 +235,8 @@ def is_sound(imu: Imu, settings: PolicySettings) -> bool:
 
 def is_reserve(imu: Imu, bad: Imu, settings: PolicySettings) -> bool:
     """Return whether the autopilot flies better with an IMU than with a bad one."""
-    is_fine = bool(bad.worst) and bad.worst in imu.fine
-    survives = bad.stuck and imu.survives
-    return is_alive(imu) and (is_fine or survives or is_sound(imu, settings))
+    is_fine = is_alive(imu) and bool(bad.worst) and bad.worst in imu.fine
+    return is_fine or is_sound(imu, settings)
 
 
 def is_refused(memory: Memory) -> bool:
