@@ -241,7 +241,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
         update_excess(params, kf)
     if kf.all_blocks % BLOCKS_PER_COARSE == 0:
         look_for_slow_faults(params, state)
-        doubt_start(params, kf)
+        doubt_start(params, kf, not state.restored)
 
 
 @compiled

@@ -22,6 +22,10 @@ FAR = 4.0
 """Standard deviations from which a bias is far beyond its prior: one healthy start in 16 000."""
 DOUBTED = 3.0
 """The same from which the covariance allows for it, in full from `FAR` on."""
+START_FOR = 10.0
+"""Time in which the start is judged, s. Later, vibration, holes and warming move healthy biases."""
+HEALED = 0.25
+"""Share of a far bias below which the states have left it: of two units they hold half of it."""
 FARTHEST = 12.0
 """Multiple of ``turn_on_std`` from which a steady rate is a turn, whatever the biases."""
 UNSHOWN = 0.25
@@ -31,35 +35,48 @@ LEAST_SHOWN = 0.05
 
 
 @compiled
-def doubt_start(params: Constants, kf: Estimator) -> None:
+def doubt_start(params: Constants, kf: Estimator, is_start: bool) -> None:
     """Find the biases that are far beyond their priors, and the error of all if the worst has none.
 
-    Written to ``kf.far_bias``, rad/s, zero where a bias is plausible, and to ``kf.bias_error``.
+    Written to ``kf.far_bias``, rad/s, zero where a bias is plausible, and to ``kf.bias_error``. What
+    is found stays until the bias heals. ``is_start``: the states began with their priors.
     """
-    n = params.sensors.n
-    states = kf.states
-    doubt_steady_rate(params, kf)
-    for i in range(n):
-        kf.far_bias[i] = kf.bias_error[i] = 0.0
     if params.turn_on == 0.0:
         return
+    doubt_steady_rate(params, kf)
+    if not is_start or kf.seconds > START_FOR:
+        forget_healed(params, kf)
+        return
+    n = params.sensors.n
+    states = kf.states
+    prior = params.turn_on**2
     worst = -1
     largest = DOUBTED * DOUBTED
     for i in range(n):
-        prior = prior_variance(params, kf.seconds, i)
+        kf.far_bias[i] = kf.bias_error[i] = 0.0
         shown = prior - states.p[i, i]
         if shown > LEAST_SHOWN * prior and states.x[i] ** 2 > largest * shown:
             largest = states.x[i] ** 2 / shown
             worst = i
     if worst < 0:
         return
-    shown = prior_variance(params, kf.seconds, worst) - states.p[worst, worst]
-    weight = weight_of(largest)
+    shown = prior - states.p[worst, worst]
     for i in range(n):
         error = states.p[i, worst] * states.x[worst] / shown
-        kf.bias_error[i] = weight * error
+        kf.bias_error[i] = weight_of(largest) * error
         if largest > FAR * FAR:
             kf.far_bias[i] = far_bias(params, kf, i, worst)
+
+
+@compiled
+def forget_healed(params: Constants, kf: Estimator) -> None:
+    """Forget what the start has shown once a bias that was far has gone."""
+    healed = False
+    for i in range(params.sensors.n):
+        healed = healed or abs(kf.states.x[i]) < HEALED * abs(kf.far_bias[i])
+    if healed:
+        for i in range(params.sensors.n):
+            kf.far_bias[i] = kf.bias_error[i] = 0.0
 
 
 @compiled
@@ -102,15 +119,14 @@ def alike_variance(params: Constants, kf: Estimator, a: int) -> float:
 def far_bias(params: Constants, kf: Estimator, i: int, worst: int) -> float:
     """Return bias i if it had no prior, rad/s, or 0 if it is plausible beside the worst one."""
     states = kf.states
-    prior = prior_variance(params, kf.seconds, i)
+    prior = params.turn_on**2
     known = prior - states.p[i, i]
     if known <= LEAST_SHOWN * prior:
         return 0.0
     value = states.x[i]
     variance = known
     if i != worst:
-        shown = prior_variance(params, kf.seconds, worst) - states.p[worst, worst]
-        gain = states.p[i, worst] / shown
+        gain = states.p[i, worst] / (prior - states.p[worst, worst])
         left = known - gain * states.p[i, worst]
         # Else only the difference of the two is known: either may be the one.
         if left > LEAST_SHOWN * prior:
@@ -118,17 +134,3 @@ def far_bias(params: Constants, kf: Estimator, i: int, worst: int) -> float:
             variance = left
     is_far = value * value > FAR * FAR * variance
     return value * prior / variance if is_far else 0.0
-
-
-@compiled
-def prior_variance(params: Constants, seconds: float, i: int) -> float:
-    """Return the variance of a bias after some time without any measurement, (rad/s)^2."""
-    layout = params.layout
-    variance = params.turn_on**2 + layout.walk[i] ** 2 * seconds
-    for r in range(layout.n, layout.count):
-        if layout.feeds[r] == i:
-            # Integral of a Gauss-Markov process.
-            spans = seconds / layout.memory[r]
-            drift = layout.prior[r] * layout.memory[r]
-            variance += 2.0 * drift**2 * (spans - 1.0 + math.exp(-spans))
-    return variance

@@ -241,9 +241,9 @@ class _Beside:
     ) -> None:
         self.positions = find_positions(block, config, gyros)
         self.settings = _settings(config, active, step, gyros)
-        if not trusted:
-            common = max(config.noise.shared_scale_std, SHARED_SCALE)
-            self.settings["noise.shared_scale_std"] = common
+        # The axes of a trusted unit are true.
+        common = config.noise.shared_scale_std or SHARED_SCALE
+        self.settings["noise.shared_scale_std"] = 0.0 if any(trusted) else common
         self.settings |= position_settings(self.positions, config)
         self.config = config.replaced(self.settings)
         self.ready: Prepared | None = None

@@ -20,10 +20,19 @@ GRAVITY = 9.81
 
 
 def fly(
-    units: int, errors: dict[str, float], begin: float = 0.0, seed: int = 1
+    units: int,
+    errors: dict[str, float],
+    begin: float = 0.0,
+    end: float = np.inf,
+    seconds: float = SECONDS,
+    hole: float = 0.0,
+    seed: int = 1,
 ) -> tuple[Status, Output, np.ndarray]:
-    """Return status and output after a gentle flight with constant errors, and the true force."""
-    t = np.arange(0.0, SECONDS, INTERVAL)
+    """Return status and output after a gentle flight with constant errors, and the true force.
+
+    hole: length of a hole in the stream each 20 s, s.
+    """
+    t = np.arange(0.0, seconds, INTERVAL)
     random = np.random.default_rng(seed)
     phase = random.uniform(0.0, 6.0, 3)
     rate = [0.4, 0.3, 0.2] * np.sin(np.outer(t, [0.9, 1.3, 0.5]) + phase)
@@ -45,8 +54,8 @@ def fly(
         unit, channel = name.split(".")
         column = 3 * int(unit[-1]) - 3 + "xyz".index(channel[-1])
         half = forces if channel.startswith("accel") else gyros
-        half[t >= begin, column] += error
-    stamp = 10**9 + (1e9 * t).astype(np.int64)
+        half[(t >= begin) & (t < end), column] += error
+    stamp = 10**9 + (1e9 * (t + hole * (t // 20.0))).astype(np.int64)
     output = pipeline.process(Block(stamp, gyros, acceleration=Block(stamp, forces)))
     return pipeline.status(), output, force
 
@@ -157,3 +166,22 @@ def test_a_steady_turn_stays_certain(turn: float, rested: bool) -> None:
     """After a rest the biases are known, and no biases explain a fast turn."""
     for nees in stand_and_move(0.0, turn, rested):
         assert 0.05 < nees.mean() < 2.0
+
+
+@pytest.mark.parametrize("seconds", [60.0, 600.0])
+def test_the_doubt_about_a_start_stays_while_the_error_does(seconds: float) -> None:
+    status, output, force = fly(3, {"imu_2.accel_y": 2.9}, seconds=seconds)
+    assert far(status) == ["imu_2.accel_y"]
+    assert normalised_error(output, force) < 1.0
+
+
+def test_the_doubt_about_a_start_ends_with_the_error() -> None:
+    status, *_ = fly(3, {"imu_2.accel_y": 5.0}, end=30.0, seconds=120.0)
+    assert not far(status)
+
+
+@pytest.mark.parametrize("seed", range(1, 7))
+def test_holes_in_the_stream_are_no_start(seed: int) -> None:
+    """Biases may have moved in each, which widens their covariance."""
+    status, *_ = fly(3, {}, seconds=120.0, hole=50.0, seed=seed)
+    assert not far(status)
