@@ -206,9 +206,7 @@ def parse_check(text: str, faults: int, names: Sequence[str] = ()) -> list[Condi
         part = parts.pop(0)
         if parts and parts[0].lower() in CHANNEL_STATES:
             text = f"{part} {parts[0].lower()}"
-            meant = tuple(
-                name for name in names if name == part or name.startswith(f"{part}.")
-            )
+            meant = _channels_meant(part, names)
             if not meant:
                 raise ConfigError(
                     f"--check: {text!r} names no channel, {did_you_mean(part, names)}"
@@ -223,6 +221,18 @@ def parse_check(text: str, faults: int, names: Sequence[str] = ()) -> list[Condi
             )
         found.append(condition)
     return found
+
+
+def _channels_meant(part: str, names: Sequence[str]) -> tuple[str, ...]:
+    """Return a channel, or those of a unit, as in a fault: its gyros, or its accelerometers."""
+    forces = f"{part}_" if part.endswith(".accel") else ""
+    return tuple(
+        name
+        for name in names
+        if name == part
+        or (forces and name.startswith(forces))
+        or (name.startswith(f"{part}.") and not name.startswith(f"{part}.accel_"))
+    )
 
 
 def _on_quantity(part: str) -> Condition:

@@ -264,3 +264,13 @@ def test_status_texts_of_a_telemetry_log_are_told(root):
     with Recording(log) as recording:
         texts = [one.text for one in recording.texts]
     assert {"AHRS: EKF3 active", "EKF3 IMU1 is using GPS"} <= set(texts)
+
+
+def test_a_condition_on_a_unit_is_about_its_gyros_or_its_accelerometers():
+    names = [f"imu_1.{one}" for one in ("x", "y", "z", "accel_x", "accel_y", "accel_z")]
+    (gyros,) = parse_check("imu_1 faulty", 0, names)
+    (forces,) = parse_check("imu_1.accel ok", 0, names)
+    (one,) = parse_check("imu_1.accel_y stale", 0, names)
+    assert gyros.channels == tuple(names[:3])
+    assert forces.channels == tuple(names[3:])
+    assert one.channels == ("imu_1.accel_y",)
