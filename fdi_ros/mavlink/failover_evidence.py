@@ -68,9 +68,11 @@ SHOWN = 2.0
 #: healed ones stay out in a circle.
 SAME_TURN = 0.8
 TINY = 1e-3  #: Resolution of the messages, rad/s.
-#: An axis moves if its mean rate and that of another IMU change alike, by this or more, rad/s, and
-#: by so many standard deviations of noise. A steady rate is no motion: both axes may be stuck at it.
+#: An axis moves if its mean rate and the one of another IMU change alike, by this or more, rad/s. A
+#: steady rate is no motion: both axes may be stuck at it.
 MOVES = 0.005
+#: The change must also exceed this multiple of the noise in the mean. At 3, two axes that died 10 s
+#: apart in noise of 6 mrad/s outvote the third IMU in 2 of 12 flights, at 4 in none.
 MOVES_SIGMAS = 4.0
 MOVES_WITHIN = NS  #: Longest time of that change, ns.
 #: An axis that has not moved for this time, ns, may be dead: it is no witness. In the logs of two

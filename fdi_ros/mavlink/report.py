@@ -265,7 +265,7 @@ class Announcer:
         }
         """State and set of each channel, and the trouble of the whole. Empty: none."""
         self._said = dict(self._now)  # the same as last announced
-        self._good_since = dict.fromkeys(self._now, 0)  # when each became OK, ns
+        self._changed_at = dict.fromkeys(self._now, 0)  # when each last did, ns
         self._apart = dict.fromkeys(channels, "")
         """Present difference of each channel and the other of its pair, rad/s."""
         # Estimated, rad/s, of an accelerometer m/s^2.
@@ -307,7 +307,7 @@ class Announcer:
     def _note(self, name: str, found: tuple[str, str], now: int) -> None:
         if found != self._now[name]:
             self._now[name] = found
-            self._good_since[name] = now
+            self._changed_at[name] = now
             self._changed = now if self._changed is None else self._changed
 
     def due(self, now: int) -> list[tuple[int, str]]:
@@ -352,7 +352,7 @@ class Announcer:
             name: found
             for name, found in self._now.items()
             if found != self._said[name]
-            and (found[0] != "OK" or now - self._good_since[name] >= GOOD_FOR)
+            and (found[0] != "OK" or now - self._changed_at[name] >= GOOD_FOR)
         }
         groups = dict.fromkeys(
             found for found in left.values() if found[0] == "AMBIGUOUS"
@@ -384,14 +384,14 @@ class Announcer:
             units = {name.rpartition(".")[0] for name in names}
             beside = []
             if len(names) > 1 and len(units) == 1:
-                is_good = self._now[names[0]][0] == "OK"
+                wanted = "OK" if self._now[names[0]][0] == "OK" else "FAULTY"
                 beside = [
                     one
                     for (one, *others) in alike
                     if one in self._forces
                     and not others
                     and one.rpartition(".")[0] in units
-                    and (self._now[one][0] == "OK") == is_good
+                    and self._now[one][0] == wanted
                 ]
             if len(beside) > 1:
                 told.update(beside)
@@ -417,10 +417,10 @@ class Announcer:
         severity, words = _STATES.get(state, (INFO, "agrees again"))
         if names[0] in self._forces:
             if state in ("FAULTY", FAR) and self._errors[names[0]] > 0.0:
-                words = f"off by {self._errors[names[0]]:.1f} m/s^2"
-            if sum(now[0] == FAR for now in self._now.values()) > 1:
-                # Two that differ: either may be the one.
-                words = words.replace("m/s^2", "m/s^2?") if state == FAR else words
+                # Of two that differ, either may be the one.
+                far = sum(found == FAR for found, _ in self._now.values())
+                mark = "?" if state == FAR and far > 1 else ""
+                words = f"off by {self._errors[names[0]]:.1f} m/s^2{mark}"
             return max(severity, WARNING), _fit(self._forces[names[0]], words)
         if state == "FAULTY" and max(map(self._errors.__getitem__, gyros)) < GRAVE:
             severity = WARNING
