@@ -48,7 +48,7 @@ from fdi_ros.core.judging import (
     take_verdict,
 )
 from fdi_ros.core.level import update_level
-from fdi_ros.core.records import Bank, Core, Sample
+from fdi_ros.core.records import Bank, Core, OutputRow, Sample
 from fdi_ros.core.repeated import all_repeat, update_repeated, without_coarse_steps
 from fdi_ros.core.restamping import restamp
 from fdi_ros.core.states import alive, left_out, out_of_use, update_states, write_events
@@ -134,11 +134,26 @@ def run(
         if waits:
             return k, count, True
         for half in range(halves):
-            outs[half][k] = paths[half].core[0].last
+            core = paths[half].core[0]
+            outs[half][k] = core.last
+            if half > 0:
+                multiply(outs[half][k], core.settings.natural, core.settings.n)
         wants = wants_supply(paths, halves)
         if wants or (stop_at_event and count > before):
             return k + 1, count, wants
     return len(samples), count, False
+
+
+@compiled
+def multiply(row: OutputRow, natural: float, n: int) -> None:
+    """Multiply the results of a row by the natural size of the quantity, which the path divides by."""
+    for a in range(3):
+        row.rate[a] *= natural
+        row.level[a] *= natural
+    for a in range(6):
+        row.covariance[a] *= natural**2
+    for i in range(n):
+        row.residual[i] *= natural
 
 
 @compiled

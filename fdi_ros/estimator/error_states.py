@@ -205,6 +205,8 @@ def begin_states(layout: Layout, states: ErrorStates, bias_std: Array) -> None:
 @compiled
 def shared_variance(layout: Layout, at: Projection, i: int) -> float:
     """Return the variance of channel i by scale errors that all channels share, (rad/s)^2."""
+    if layout.shared_scale == 0.0:
+        return 0.0
     variance = 0.0
     for signal in range(SIGNALS):
         axis = layout.by[signal] - RATE_X

@@ -428,7 +428,8 @@ class Pipeline:
                 # The level of the row before was not known; otherwise this changes nothing.
                 for half, rows in zip(halves, outs, strict=False):
                     if not is_between:
-                        rows["level"][row - 1] = half.core["last"]["level"][0]
+                        level = half.core["last"]["level"][0]
+                        rows["level"][row - 1] = half.quantity.natural * level
             if (events and stop and not is_between) or row == size:
                 yield self._output((outs[0][first:row], outs[1][first:row]), events)
                 first = row
@@ -437,14 +438,11 @@ class Pipeline:
     def _output(
         self, rows: tuple[NDArray[Any], NDArray[Any]], events: list[Event]
     ) -> Output:
-        """Put together what samples gave, rows (N,) of gyros and accelerometers, which leave in their unit."""
+        """Put together what samples gave, rows (N,) of gyros and accelerometers."""
         names = self.channel_names
         n = self.geometry.n
         acceleration = None
         if self.accelerometers is not None:
-            for name in ("rate", "residual", "level"):
-                rows[1][name] *= FORCE.natural
-            rows[1]["covariance"] *= FORCE.natural**2
             own = [
                 of_accelerometers(event, n) for event in events if event.channel >= n
             ]
