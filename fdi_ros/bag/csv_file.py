@@ -529,7 +529,7 @@ def _imus(names: Sequence[str], note: Note) -> list[list[str]]:
 def _forces(names: Sequence[str], imus: Any) -> list[list[str]]:
     """Return the columns x, y, z of the accelerometer of each IMU, in the order of the names.
 
-    None, unless there is one for each IMU: nothing tells which of them lacks one. Nor
+    None, unless there is one for each IMU: nothing tells which IMU lacks one. Nor
     is one taken whose unit is unknown: its rates are of use without it.
     """
     found = [

@@ -141,7 +141,7 @@ def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
     """Find messages, schemas and channels in a run of bytes, as `walk` does.
 
     Schemas and channels beyond the first `DESCRIPTIONS` are skipped: an empty record
-    takes 9 bytes, and listing millions of them would take 40 bytes each. ``found`` (5,
+    takes 9 bytes, and a list of millions of messages would take 40 bytes each. ``found`` (5,
     room) receives per record: opcode, channel and log time (messages only), offset,
     length. Returns the number of records, those beyond the room included, and the end
     of the walk.

@@ -36,7 +36,7 @@ class RecorderClock:
         return min(self._shift.values(), default=0)
 
     def begin_file(self) -> None:
-        """Take a step back to any time for that of a clock: a further file of the recorder begins."""
+        """Take a step back to any time for a step of the clock: a further file of the recorder begins."""
         self._first.clear()
 
     def follow(self, topic: Int, time: Int) -> Int:

@@ -255,7 +255,7 @@ class Outputs:
         severity
             Severity of the verdict in the first line of the text. None: no verdict.
         others
-            Functions that write the files of other options, by the names of these.
+            Functions that write the files of other options, by the names of the options.
 
         Returns
         -------
@@ -266,7 +266,7 @@ class Outputs:
                 html(), encoding="utf-8", errors="replace"
             )
         with ExitStack() as stack:
-            # The files appear only at the end, so that a failure leaves none of them.
+            # The files appear only at the end, so that a failure leaves no file.
             for name, write in others.items():
                 if name in self.targets:
                     write(stack.enter_context(whole(self.targets[name])))

@@ -264,7 +264,7 @@ class Kept(_Files):
         check_trusted(path)
 
     def _close(self) -> None:
-        """Check that no other user can write the folder of the function, or one between it and that of all results."""
+        """Check that no other user can write the folder of the function, or one between it and the top folder."""
         inside = Path(self._cache_path)
         top = folder()
         above = [one for one in inside.parents if one.is_relative_to(top)]

@@ -123,7 +123,7 @@ def progress_logged(
     done
         Returns the names of the functions that were compiled so far.
     needs_all
-        Whether all of them will be compiled. Otherwise neither share nor time left are known.
+        Whether all will be compiled. Otherwise neither share nor time left are known.
 
     The time left, reported once a fifth of the functions is done, assumes that the rest takes as
     long for each function.

@@ -197,7 +197,7 @@ class Config:
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """The input topics: of the units, or of the array of gyros and that of accelerometers."""
+        """The input topics: of the units, or of the arrays of gyros and of accelerometers."""
         if self.has_units:
             return self.imus.topics
         array = self.channels

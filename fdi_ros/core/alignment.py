@@ -540,7 +540,7 @@ class Alignment:
     Raises
     ------
     ConfigError
-        If a value is out of bounds, or if the number of delays is not that of units.
+        If a value is out of bounds, or if there are not as many delays as units.
     """
 
     def __init__(

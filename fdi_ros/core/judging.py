@@ -56,7 +56,7 @@ def judge_sample(
     if row == UNPREPARED:
         return False
     clear_verdict(verdict, bank.n)
-    # What the method does not state of this sample is not that of an earlier one.
+    # What the method does not state of this sample must not stay from an earlier one.
     sample.estimate.is_current = False
     sample.estimate.checked = sample.estimate.doubtful = 0
     if row == REFUSED:

@@ -288,7 +288,7 @@ def integrity_labels(names: Sequence[str], n: int) -> list[str]:
 def fill_integrity(out: Bytes, at: int, row: OutputRow, n: int, shift: int) -> None:
     """Write the values of the gyros and the stamp into the integrity message.
 
-    ``out`` and ``at`` are as for `fill_imu`. The stamp is that of the sample less
+    ``out`` and ``at`` are as for `fill_imu`. The stamp is the stamp of the sample less
     ``shift``, ns.
     """
     end = fill_half(out, at, row, n, 1.0)

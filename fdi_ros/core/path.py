@@ -57,7 +57,7 @@ from fdi_ros.core.subsets import fill_rate
 #: A channel is noisy from this multiple of the expected or its usual noise on: its weight
 #: in the rate is then a tenth.
 NOISY = 3.0
-#: This multiple must also exceed that of every channel of the other units by this factor:
+#: It must also exceed the multiple of every channel of the other units by this factor:
 #: vibration of the body shows on more than one unit.
 NOISIER = 1.8
 #: Share of the range. If the others predict less, a value out of range is a fault.

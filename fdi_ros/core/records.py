@@ -481,7 +481,7 @@ class Turning:
     acceleration: Vector  # its derivative, rad/s^2
     newest: Vector  # fused rate of the last sample that had one, rad/s
     usable: Vector  # fused rate of this sample, NaN if not sure enough, rad/s
-    unsmoothed: Acceleration  # of those rates
+    unsmoothed: Acceleration  # of the rates above
     known: Flag  # rate and angular acceleration of this sample are known
     part: Channels  # what it adds to each accelerometer, in the unit of the path
     hidden: Mask  # accelerometers that it moves by an unknown amount
@@ -588,7 +588,7 @@ class EventRow:
 
 @record
 class PathSettings:
-    """Settings, constant over samples. A change of the detector changes some of them."""
+    """Settings, constant over samples. A change of the detector changes some."""
 
     n: Whole  # channels
     first: Whole  # number of the first channel among all channels of the monitor
@@ -664,7 +664,9 @@ class Current:
     shared_error: Axes  # C G', covariance of channel errors with the rate, (rad/s)^2
     moved: Channels  # change of each channel since another one repeats its value, rad/s
     variance: Channels  # of noise and other errors of single samples, (rad/s)^2
-    uncertainty: Channels  # `variance` plus that of the estimated errors, (rad/s)^2
+    uncertainty: (
+        Channels  # `variance` plus the variance of the estimated errors, (rad/s)^2
+    )
     own: Channels  # the same without what all channels share: what weights reduce
     parity: Parity
     rival: Channels  # A z of channels fused and left out, s/rad
@@ -675,7 +677,7 @@ class Current:
     plain_rate: Vector  # of the fused channels with expected weights, rad/s
     error_ratio: Channels  # error variance with the remaining bias, in noise_std^2
     uncovered: Vector  # level without the rivals of the declared channels, rad/s
-    covered: Vector  # largest level with the rivals of one of them, rad/s
+    covered: Vector  # largest level with the rivals of one channel, rad/s
     guard: SampleVerdict  # of the estimator's own detector
     verdict: SampleVerdict  # of the method that declares
     scaled: Channels  # corrected values, residuals scaled to the expected noise, rad/s

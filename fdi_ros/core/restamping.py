@@ -37,7 +37,7 @@ def restamp(
     sample
         The sample.
     received, plain
-        Masks of the values received, and of those finite and in range.
+        Masks of the values received, and of the values finite and in range.
     out
         Receives the values, NaN where missing.
 

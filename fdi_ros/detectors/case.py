@@ -740,7 +740,7 @@ def fade_fits(case: Case, n: int, seconds: float) -> None:
 
 @compiled
 def forget_fits(case: Case, n: int, seconds: float) -> None:
-    """Forget so many seconds of the time in which faults have not explained the mean."""
+    """Forget ``seconds`` of the time in which faults have not explained the mean."""
     for i in range(n):
         for j in range(n):
             case.unfit[i, j] = max(case.unfit[i, j] - seconds, 0.0)

@@ -122,7 +122,7 @@ FEW_CHECKS = 3
 """With so few checks, three faults or a shift explain any mean."""
 SET_MARGIN = 5.0
 """Accepted risk that a set misses one of several faulty channels, as a multiple of the
-risk of a wrong name. The risk that it misses all of them is far smaller."""
+risk of a wrong name. The risk that it misses all is far smaller."""
 #: Log odds of what is impossible. Infinity would give NaN in differences.
 NO_LOG = -1e300
 
@@ -166,7 +166,7 @@ class Inference:
     amplitude: Vector  # estimated f, rad/s
     fit: Real  # part of ``total`` that the last hypothesis explains with its best amplitude
     count: Whole  # number of hypotheses
-    small: Whole  # of these the first ones, of one channel or two
+    small: Whole  # the first ones, of one channel or two
     odds: Odds  # log odds, later shares
     fits: Odds  # ``fit`` of each hypothesis
     errors: Errors  # error of each channel by each hypothesis, rad/s

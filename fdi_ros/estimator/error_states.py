@@ -437,7 +437,7 @@ def fill_gain(
 def bound_variance(
     layout: Layout, states: ErrorStates, place: int, value: float, variance: float
 ) -> None:
-    """Bound the variance of a state to that of a value, which moves the state towards it.
+    """Bound the variance of a state to the variance of a value, which moves the state towards it.
 
     A value adds only the information that the state does not have yet, however often it is given.
     """

@@ -175,7 +175,7 @@ class Estimator:
     largest_delay: Real  # largest delay between units, s
     chi_ratio: Real  # chi-square of the last sample over the largest usual, at least 1
     outliers: Mask  # channels of the last sample that are too far off to be used in it
-    spiked: Mask  # of these, those of a spike; all, if the culprit is not known
+    spiked: Mask  # the outliers that are spikes; all, if the culprit is not known
     spikes: Counts  # of each channel so far
     # square of the last deviation of a channel from the others, (rad/s)^2, until they
     # agree again or one is declared, or 0
@@ -290,7 +290,7 @@ class Estimator:
     counted_variance: Real  # part of it that the covariance of samples contains
     strongest_vibration: Real  # mean square of the strongest lately, (rad/s)^2
     usual_vibration: Real  # mean square when it last changed, (rad/s)^2
-    vibration_changes: Flag  # that of the last block is another one than the usual
+    vibration_changes: Flag  # in the last block, from the usual one
     vibration_changed_at: Real  # when it last did, s since the start
     rest_rates: Window  # of the last blocks, rad/s
     rest_noise: Vector  # variance of the rate of a block, (rad/s)^2

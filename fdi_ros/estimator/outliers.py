@@ -45,7 +45,7 @@ def find_outliers(params: Constants, kf: Estimator, values: Array) -> None:
     """Find the outliers of a sample, and correct the sample without possible spikes."""
     kf.outliers = kf.spiked = 0
     if stays_in_doubt(params, kf):
-        # The rate may be that of the faulty channels alone: nothing is learned from it.
+        # The faulty channels alone may have given this rate: nothing is learned from it.
         kf.spiked = kf.mask
         for i in range(params.sensors.n):
             kf.imputed[i] = kf.corrected[i]

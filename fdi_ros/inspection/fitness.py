@@ -89,7 +89,7 @@ def left_out(reports: Sequence[TopicReport]) -> list[tuple[str, str]]:
 
 
 def clocks_apart(reports: Sequence[TopicReport], beyond: float = 1.0) -> str:
-    """Name the units whose clocks differ from that of the first by more than a limit, s.
+    """Name the units whose clocks differ from the first by more than a limit, s.
 
     Differences below 1 s may be the transport time of messages. Empty if no clock
     differs.

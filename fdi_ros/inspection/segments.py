@@ -209,7 +209,7 @@ def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
 def without_spikes(values: Array) -> tuple[Array, Mask]:
     """Replace the spikes in values (N, c) by the median of the values around them.
 
-    Returns the values (N, c), and which of them were spikes. The first and last
+    Returns the values (N, c), and which were spikes. The first and last
     `SPIKE_REACH` values are not examined.
     """
     spikes = np.zeros(values.shape, dtype=bool)

@@ -72,7 +72,7 @@ class TopicReport:
     backward: int = 0
     #: longest step back of the stamps, s
     set_back: float = 0.0
-    #: messages with a time of recording before that of the message ahead of them
+    #: messages with an earlier time of recording than the message ahead
     disordered: int = 0
     #: lead of the first stamps over their times of recording, s, NaN if not stamped
     ahead: float = math.nan

@@ -292,7 +292,7 @@ class Failover:
     def _is_same_boot(self, ago: float) -> bool:
         """Return whether the autopilot has run since before the file was written.
 
-        The autopilot started ``ago`` seconds ago. Its clock and that of this computer have
+        The autopilot started ``ago`` seconds ago. Its clock and the clock of this computer have
         gone on alike, or not. Unix time is compared only if this computer was started in
         between, and not together with the autopilot: without a time source, Unix time may
         begin at the same value after each power cut.

@@ -76,8 +76,8 @@ class Motion(NamedTuple):
 
     largest: float  #: Largest rate.
     gain: Vector  #: By how much the rate has grown, by axis.
-    mean: Vector  #: Mean rate: that of a turn.
-    std: Vector  #: Standard deviation of the rate: that of a shake.
+    mean: Vector  #: Mean rate, as of a turn.
+    std: Vector  #: Standard deviation of the rate, as of a shake.
 
 
 class Rows:
@@ -198,7 +198,7 @@ class RawComparison:
         self._longest = 7 * interval // 5
         self._lag = max(1, SKEW // interval)
         self._averaged = max(1, AVERAGED // interval)
-        #: Fewest samples that are averaged, and the number of those within `QUICK`.
+        #: Fewest samples that are averaged, and how many within `QUICK`.
         self.fewest = max(FEWEST, QUICK // interval + 1)
         self._last: list[tuple[int, Vector]] = [(-NS, UNKNOWN_RATES)] * count
         self._recent = [Rows(KEPT) for _ in range(count)]
@@ -287,7 +287,7 @@ class RawComparison:
         return x, y, z
 
     def _rates(self, unit: int, periods: int = 1) -> np.ndarray:
-        """Return the rates of an IMU within so many times `AVERAGED`, rad/s. NaN: none."""
+        """Return the rates of an IMU within ``periods`` times `AVERAGED`, rad/s. NaN: none."""
         rates = self._recent[unit].last(periods * self._averaged)
         return rates if len(rates) else np.array([UNKNOWN_RATES])
 

@@ -98,7 +98,9 @@ class Pipeline:
         """Whether the first samples are to show which units have accelerometers."""
         self.felt: tuple[int, ...] = ()
         """Numbers of the units whose accelerometers are judged; of an array those of the accelerometers."""
-        self._places = np.zeros(0, dtype=np.int64)  # of these among all of a sample
+        self._places = np.zeros(
+            0, dtype=np.int64
+        )  # among all accelerometers of a sample
         self._built: dict[tuple[int, ...], Pipeline] = {}
         self.core = build_core(config, self.geometry, self.noise)
         """All that the sample path is given and remembers, (1,) `fdi_ros.core.records.Core`."""
@@ -120,7 +122,7 @@ class Pipeline:
 
     @property
     def halves(self) -> tuple[Pipeline, ...]:
-        """The monitor of the gyros, and that of the accelerometers if there are any."""
+        """The monitor of the gyros, and of the accelerometers if there are any."""
         return (self,) if self.accelerometers is None else (self, self.accelerometers)
 
     @property

@@ -42,7 +42,7 @@ LEAST_VISIBLE_SHARE = 1e-3
 """Smallest share of the errors of a channel that is taken to show in its residual."""
 LEAST_OF_VISIBLE = 0.25
 """Smallest visible share of the errors of a channel, over the share with equal noise.
-So a noise below a third of that of all parallel channels counts as a third."""
+So a noise below a third of all parallel channels counts as a third."""
 LEAST_DRIFT_RAD_S = 0.02
 """Move of the bias of a gyro that is reported, rad/s. It is 1.4 mrad/s at most in 12 recordings
 without a known fault, up to 20 mrad/s where sensors warm up in simulation, and 30 mrad/s before a real crash."""
@@ -110,7 +110,7 @@ class UnitHealth:
     topic: str
     """Topic that carries it."""
     delivered: float = 1.0
-    """Share of its messages that arrived, by its usual rate and that of the other units."""
+    """Share of its messages that arrived, by its usual rate and the rate of the other units."""
     rate_hz: float | None = None
     """Usual messages per second, Hz. None: not measured."""
     slow_from_s: float | None = None
@@ -533,7 +533,7 @@ def _noisy_for_a_time(channels: Sequence[ChannelHealth]) -> list[Concern]:
     """Return concerns about channels that were noisy for a time, one for each time.
 
     Channels of several units that are noisy at once measure the same axis: only their
-    difference is known, and one of them is noisy.
+    difference is known, and one is noisy.
     """
     found = []
     left = sorted(channels, key=lambda one: -one.noisy_s)

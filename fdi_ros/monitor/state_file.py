@@ -36,7 +36,7 @@ FILE_BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')  # what a state file begins wi
 MAX_BYTES = 1 << 20  # largest state file, bytes. Longer files are damaged
 PLAUSIBLE = 5.0  # expected standard deviations within which a saved error is believed, beside its walk since
 SAVED_CHANGE = 2.0
-"""Errors are saved again once one of them differs from its saved value by this many
+"""Errors are saved again once one differs from its saved value by this many
 standard deviations, or is known this many times better. A smaller change is covered by
 the random walk that is added for the age of the file when it is restored."""
 DIGITS = 9  # of the figures saved
@@ -92,7 +92,7 @@ def _content(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def _whole_content(pipeline: Pipeline) -> dict[str, Any]:
-    """Return the lasting state of gyros and accelerometers; that of the latter in units of `FORCE.natural`."""
+    """Return the lasting state of gyros, and of accelerometers in units of `FORCE.natural`."""
     other = pipeline.accelerometers
     felt = {"units": list(pipeline.felt)}
     accelerometers = None if other is None else {**_content(other), **felt}

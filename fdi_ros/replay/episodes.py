@@ -342,7 +342,7 @@ def _whole(parts: Sequence[Episode], units: Sequence[str]) -> Episode:
 HALVES = {RADIANS.name: "gyros", FORCES.name: "accelerometers"}
 """Kinds of sensors of a unit, by the unit of their figures."""
 MOST_TOLD = 5
-"""Episodes in the summary. The tables have all of them."""
+"""Episodes in the summary. The tables have all."""
 TOO_SMALL = "too small to measure"
 """Words for a size below its standard error."""
 LEAST_BEFORE = 0.05

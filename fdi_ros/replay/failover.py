@@ -143,7 +143,7 @@ class FailoverReplay(Sink):
     def text(self, origin: int | None = None) -> str:
         """Return the orders in one line.
 
-        ``origin``: stamp from which times count, ns. None: that of the first sample.
+        ``origin``: stamp from which times count, ns. None: the stamp of the first sample.
         """
         shift = 0 if origin is None or self._first is None else self._first - origin
         done = [f"{one.words} at {(one.at + shift) / NS:.1f} s" for one in self._done]

@@ -351,7 +351,7 @@ class Evaluation:
         self.without_rate = 0
         """Number of samples without a fused rate after the first one with a rate."""
         self.without_rate_from: float | None = None
-        """Time of the first of these samples, s from the first message."""
+        """Time of the first sample without a rate, s from the first message."""
         self._has_had_rate = False
         self._unexplained: list[StateChange] = []
         self._unchecked = np.zeros(n)

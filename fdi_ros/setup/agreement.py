@@ -54,7 +54,7 @@ def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) 
 
     Configured axes suffice for that, except for unknown mounts. `DisagreementError`
     names the unit with another scale or other axes, the channel without response, or
-    all of them if nothing decides.
+    all if nothing decides.
     """
     means = data.slow_rates()
     if len(means) < LEAST_WINDOWS:

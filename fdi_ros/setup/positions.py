@@ -205,7 +205,7 @@ def _windows_of(
     first: Array, other: Array, turning: Array, noise: Array, blocks: Blocks
 ) -> _ForceEvidence:
     """Return the evidence in forces (B, 3) of the first unit and of another one."""
-    # The noise of the difference is not that of the mean.
+    # The difference has other noise than the mean.
     difference = _smooth(other - first)
     mean = _smooth(0.5 * (first + other))
     signals = np.zeros((len(mean), 3, STATES))
