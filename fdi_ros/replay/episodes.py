@@ -18,6 +18,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.replay.warming import Warming
 from fdi_ros.report.layout import FORCES, RADIANS, Unit
 from fdi_ros.system.text import figures, listed, percent, plus_minus
 
@@ -181,6 +182,11 @@ class Episode:
     halves: tuple[Episode, ...] = ()
     """Episodes of gyros and of accelerometers that are one fault of their unit. Empty: a fault of one
     kind of sensor. The halves have the candidates."""
+    warming: tuple[Warming, ...] = ()
+    """Channels whose errors follow the temperature of their unit. It explains the fault and changes
+    no declaration."""
+    warming_words: str = ""
+    """The same in sentences. Empty: no error follows a temperature, or the log has none."""
 
     @property
     def duration_s(self) -> float:
@@ -440,6 +446,44 @@ def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
     return f"{one.who} {one.state} from {one.since_s:.3f} s{until}{about}{f'; before that {before}' if before else ''}"
 
 
+def warming_words(one: Episode, unit: Unit = RADIANS) -> str:
+    """Return sentences on errors that follow the temperature of their unit. Empty: none does."""
+    if one.halves:
+        return " ".join(
+            filter(None, (warming_words(half, unit) for half in one.halves))
+        )
+    unit = unit_for(one, unit)
+    kinds = dict.fromkeys((each.unit, each.certain) for each in one.warming)
+    sentences = []
+    for who, certain in kinds:
+        alike = [
+            each for each in one.warming if (each.unit, each.certain) == (who, certain)
+        ]
+        names = listed([each.channel for each in alike])
+        if one.state == "AMBIGUOUS":
+            names += ", if faulty"
+        several = len(alike) > 1
+        errors = "their errors" if several else "its error"
+        slopes = listed(
+            [figures(abs(each.rad_s_per_c) * unit.factor, 2) for each in alike]
+        )
+        change = alike[0].range_c
+        size = f"({slopes} {unit.name} per °C over {figures(abs(change), 2)} °C)"
+        if certain:
+            verb = "follow" if several else "follows"
+            cause = "cooling" if change < 0.0 else "warming"
+            sentences.append(
+                f"{names}: {errors} {verb} the temperature of {who} {size}: {cause}."
+            )
+        else:
+            verb = "change" if several else "changes"
+            sentences.append(
+                f"{names}: {errors} {verb} with the temperature of {who} {size}. It may be"
+                " heat or a steady drift: this recording cannot show which."
+            )
+    return " ".join(sentences)
+
+
 def _about(one: Episode, unit: Unit) -> str:
     if one.state == "STALE":
         return one.evidence.reason
@@ -542,6 +586,8 @@ def detail_words(
         lines.append(("evidence", _evidence(one)))
         if rivals := _rivals(one):
             lines.append(("alternative", rivals))
+        if heat := warming_words(one, unit):
+            lines.append(("temperature", heat.removesuffix(".")))
     what = "rate" if one.measured_in == RADIANS.name else "specific force"
     return [*lines, (f"fused {what}", _rate(one, unit)), *injected]
 

@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.raw import Batch, LogText
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
@@ -46,6 +47,7 @@ from fdi_ros.replay.health import (
 from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
 from fdi_ros.replay.recurring import join_recurring
+from fdi_ros.replay.span_means import SpanMeans, Temperature, with_warming
 from fdi_ros.replay.summary import (
     AutopilotText,
     BiasResult,
@@ -189,6 +191,9 @@ class Judge(Walk):
             Recorder(half.geometry, half.noise, half.quantity)
             for half in pipeline.halves
         ]
+        self._means = [
+            SpanMeans(half.geometry, half.quantity) for half in pipeline.halves
+        ]
         self._degraded: dict[str, str] = {}
         """Last message on each degraded channel or unit, by name."""
         self._reference = pipeline.twin() if injector.faults else None
@@ -246,6 +251,11 @@ class Judge(Walk):
         ):
             recorder.add(time, half)
             noise.add(half)
+        for means, values, half in zip(
+            self._means, block.halves, output.halves, strict=True
+        ):
+            # The states of the accelerometers stand behind those of the gyros.
+            means.add(time, values.z, half.state[:, : half.n])
         super().add(block, output, rows)
 
     def judgement(self) -> Judgement:
@@ -299,6 +309,27 @@ class Judge(Walk):
             monitor,
             replace(story, episodes=tuple(episodes)),
         )
+
+    def explained(self, story: Story, context: FlightContext, origin: int) -> Story:
+        """Return a story with the errors that follow a temperature of the flight log.
+
+        ``origin``: stamp of the first message, ns.
+        """
+        source = source_of(self.pipeline.config)
+        courses = {
+            name: context.temperatures[topic]
+            for name, topic in zip(source.names, source.topics, strict=True)
+            if topic in context.temperatures
+        }
+        temperatures = {
+            name: Temperature(np.asarray((one.stamp - origin) * 1e-9), one.value)
+            for name, one in courses.items()
+        }
+        means = {
+            half.quantity.unit: one
+            for half, one in zip(self.pipeline.halves, self._means, strict=True)
+        }
+        return with_warming(story, means, temperatures)
 
     def _rate_health(self) -> RateHealth:
         """Return how the fused rate was published."""
@@ -544,7 +575,7 @@ def replay(
         detector=judgement.detector,
         scores=judgement.scores,
         monitor=replace(judgement.monitor, units=tuple(units)),
-        story=judgement.story,
+        story=judge.explained(judgement.story, context, stream.origin_ns or 0),
         bag=str(bag),
         stream=stream,
         seconds=clock() - begun,

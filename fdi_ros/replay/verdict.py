@@ -24,6 +24,7 @@ from fdi_ros.replay.episodes import (
     is_too_small,
     true_quantity,
     unit_for,
+    warming_words,
 )
 from fdi_ros.replay.summary import Judgement, ReplayVerdict
 from fdi_ros.report.layout import RADIANS, Unit
@@ -212,6 +213,8 @@ def _faulty_sentences(
     if first.since_s - first.start_s >= LEAST_BEFORE:
         sentences.append(f"First seen at {first.start_s:.1f} s.")
     lasting = _without_brief_sets(faulty)
+    heat = [words for one in lasting if (words := warming_words(one, unit))]
+    sentences += heat[:MOST_CONCERNS]
     others = dict.fromkeys(one.who for one in lasting[1:] if one.who != first.who)
     if others:
         sentences.append(f"Also {first_of(list(others), MOST_TOLD)}.")
