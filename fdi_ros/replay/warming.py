@@ -36,8 +36,9 @@ LEAST_OF_ALL = 0.5
 error is mostly one of scale."""
 RIVAL_RATIO = 3.0
 """Unexplained variance of a model over that of another from which on the other is the better one.
-In that log steps and lines leave 5 to 32 times as much as the temperature. Of 8 000 random
-walks beside temperatures that they do not know, 4 reach this ratio and `LEAST_EXPLAINED`."""
+In that log steps and lines leave 5 to 32 times as much as the temperature. Of 16 000 random
+walks beside temperatures that have no part in them, a ratio of 1.5 calls 44 warming, 2 calls 14
+and 3 none. It leaves 102 open."""
 LARGEST_SLOPE = {RATE.unit: 0.01, FORCE.unit: 0.03}
 """Largest change of a bias by temperature, in the unit of the channel per degC.
 About twice that of the data sheet of the MPU-6000 (PS-MPU-6000A-00): 20 deg/s over the 60 degC
@@ -117,7 +118,7 @@ def fit_warming(
     beside = _Regression(error, np.hstack([constant, rows[:, 3:]]))
     left = float(beside.share_left(temperature[:, None])[0])
     slope = beside.slope(temperature)
-    if left > 1.0 - LEAST_EXPLAINED or abs(slope) > largest_slope:
+    if not (left <= 1.0 - LEAST_EXPLAINED and abs(slope) <= largest_slope):
         return None
     since = time[:, None] - time[None, :-1]
     step = float(beside.share_left((since > 0.0).astype(np.float64)).min())

@@ -48,6 +48,8 @@ class Unit:
     """(K, 3) rad/s."""
     acceleration: np.ndarray
     """(K, 3) m/s^2."""
+    temperature: np.ndarray | float = 0.0
+    """(K,) degC. 0: no thermometer."""
 
 
 def units(count=3, seconds=20.0, rate=100.0, seed=0, start=10.0, apart=0):
@@ -203,6 +205,8 @@ def _samples(unit, k, messages):
         "SampleUS": unit.stamp,
         # A record that has both times is written after its sample.
         "TimeMS": (unit.stamp + 1500 * ("TimeUS" in message[2])) // 1000,
+        "T": unit.temperature,
+        "Temp": unit.temperature,
     }
     for a, axis in enumerate("XYZ"):
         logged |= {f"Gyr{axis}": unit.rate[:, a], f"Acc{axis}": unit.acceleration[:, a]}
