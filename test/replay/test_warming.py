@@ -99,6 +99,17 @@ def test_a_step_is_no_warming(count, seed, share, size, at):
         assert fit_warming(time, error, temperature, vector, np.inf) is None
 
 
+@given(seeds, st.floats(0.0, 4.0), st.floats(2.0, 5.0))
+def test_a_step_is_no_warming_where_a_heater_starts_about_then(seed, late, lag):
+    time, noise, vector = means(90, seed)
+    heated = np.maximum(time - 40.0, 0.0)
+    temperature = 30.0 + 12.0 * (1.0 - np.exp(-heated / lag))
+    step = 0.05 * (time > 40.0 + late)
+    assert fit_warming(time, noise + step, temperature, vector) is None
+    follows = noise + 0.004 * temperature
+    assert fit_warming(time, follows, temperature, vector).certain
+
+
 @given(counts, seeds, shares, sizes, st.floats(0.0, 0.8))
 def test_a_steady_drift_is_never_called_warming(count, seed, share, size, at):
     """From the start or from some time on. Beside a curved or flat temperature nothing is said."""
@@ -183,6 +194,16 @@ def test_little_warming_large_errors_and_short_records_explain_nothing(
     temperature = curved(time, 0.2, 3.3)
     error = noise + 0.0095 * temperature
     assert fit_warming(time, error, temperature, vector).certain
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.8, False), (0.95, True)])
+def test_a_temperature_that_explains_too_little_is_not_named(share, told):
+    time, noise, vector = means(400)
+    temperature = 40.0 + 5.0 * np.sin(time / 15.0)
+    heat = 0.002 * temperature
+    error = heat + noise * heat.std() / noise.std() * np.sqrt(1.0 / share - 1.0)
+    fit = fit_warming(time, error, temperature, vector)
+    assert (fit is not None) == told
 
 
 def test_an_error_of_scale_is_no_warming_though_the_rest_is():
