@@ -48,8 +48,12 @@ class Unit:
     """(K, 3) rad/s."""
     acceleration: np.ndarray
     """(K, 3) m/s^2."""
-    temperature: np.ndarray | float = 0.0
-    """(K,) degC. 0: no thermometer."""
+    temperature: np.ndarray | None = None
+    """(K,) degC. 0, as without one given: no thermometer."""
+
+    def __post_init__(self):
+        if self.temperature is None:
+            self.temperature = np.zeros(len(self.stamp))
 
 
 def units(count=3, seconds=20.0, rate=100.0, seed=0, start=10.0, apart=0):
