@@ -462,7 +462,7 @@ def topics_text(
         units += (
             f"; noise: standard deviation of one sample of each channel, {unit.name};"
         )
-        units += " motion and slow shaking do not count"
+        units += " rotation and slow shaking are no noise"
     return (
         indented(table(*told(topic_columns(reports, unit)), figures=False))
         + f"{units}\n"
