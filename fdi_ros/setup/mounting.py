@@ -189,8 +189,8 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
 
 RHO_TITLE = "Similarity of faults: correlation |rho| of the normalised residuals; 1: indistinguishable"
 WAITING_HINT = (
-    "Smallest error, rad/s, that the best possible test finds within a time, on average. This test knows channel and"
-    " size (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2 samples for a shift of s standard deviations and A"
+    "Smallest error, rad/s, that the best possible test detects within each time on average. This test knows channel"
+    " and size (Lorden 1971, Moustakides 1986): about 2 ln(A) / s^2 samples for a shift of s standard deviations and A"
     " samples between false alarms, in white noise. For the channel with the largest value; the page has all channels."
 )
 
