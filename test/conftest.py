@@ -30,6 +30,8 @@ WAITING = (
     "test_watch.py",
     "test_accelerometer_array.py",
 )
+#: processes that run the tests side by side
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 RECORDING = ROOT.parent / "shared" / "data" / "mimu_exp1"
 
 
@@ -87,14 +89,38 @@ def pytest_unconfigure():
     shutil.rmtree(os.environ["ROS_LOG_DIR"], ignore_errors=True)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    """Let each process collect the tests from another folder on.
+
+    In a fresh clone, and after a change, what one process has compiled the others then find.
+    Side by side all of them would compile the same files at the same time.
+    """
+    report = yield
+    if WORKERS > 1 and collector.path == ROOT / "test":
+        sizes = [
+            sum(file.stat().st_size for file in (one.path, *one.path.rglob("*.py")))
+            for one in report.result
+        ]
+        worker = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"))
+        first, before = 0, 0
+        while first < len(sizes) and before < sum(sizes) * worker / WORKERS:
+            before += sizes[first]
+            first += 1
+        report.result = report.result[first:] + report.result[:first]
+    return report
+
+
 def pytest_collection_modifyitems(items):
     """Begin with the tests that wait, in every second process: the others compute meanwhile.
 
     The scheduler gives each process an equal share of consecutive tests, and moves tests
     from the end of a share to a process that has done its own.
     """
-    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    waiters = (workers + 1) // 2
+    if WORKERS > 1:
+        # All processes must have one order, and each has collected in its own.
+        items.sort(key=lambda item: item.path)
+    waiters = (WORKERS + 1) // 2
     waiting = [[] for _ in range(waiters)]
     others = []
     for item in items:
@@ -107,8 +133,8 @@ def pytest_collection_modifyitems(items):
         part.sort(key=lambda item: WAITING.index(item.path.name))
     left = len(items)
     items.clear()
-    for worker in range(workers):
-        share = left // (workers - worker)
+    for worker in range(WORKERS):
+        share = left // (WORKERS - worker)
         left -= share
         begin = waiting[worker // 2] if worker % 2 == 0 else []
         count = max(0, share - len(begin))
