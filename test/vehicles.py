@@ -3,6 +3,7 @@
 
 """Recordings of vehicles with units on random mounts, late stamps and biases that move, and the truth behind them."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -136,14 +137,21 @@ def with_forces(one, arms, noise=0.05, seed=0):
 def turned(steps):
     """Return the attitude before each of the turns (N, 3), rad, each in the body frame of its time."""
     turns = np.vstack([np.zeros(3), steps[:-1]])
-    products = Rotation.from_rotvec(turns).as_quat()
-    reach = 1
-    while reach < len(products):
-        # Each product grows to twice its length: log2(N) products of arrays.
-        before = Rotation.from_quat(products[:-reach])
-        products[reach:] = (before * Rotation.from_quat(products[reach:])).as_quat()
-        reach *= 2
-    return Rotation.from_quat(products)
+    # In rows: the products along all rows at once, and then from row to row.
+    width = math.isqrt(len(turns)) + 1
+    padded = np.zeros((width * width, 3))
+    padded[: len(turns)] = turns
+    rows = Rotation.from_rotvec(padded).as_quat().reshape(width, width, 4)
+    begins = np.empty((width, 4))
+    for k in range(1, width):
+        before = Rotation.from_quat(rows[:, k - 1])
+        rows[:, k] = (before * Rotation.from_quat(rows[:, k])).as_quat()
+    before = Rotation.identity()
+    for k, ends in enumerate(rows[:, -1]):
+        begins[k] = before.as_quat()
+        before = before * Rotation.from_quat(ends)
+    first = Rotation.from_quat(np.repeat(begins, width, axis=0)[: len(turns)])
+    return first * Rotation.from_quat(rows.reshape(-1, 4)[: len(turns)])
 
 
 def forces_of(one, arms, noise=0.05, seed=0):
