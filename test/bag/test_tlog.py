@@ -4,6 +4,7 @@
 """Telemetry logs of ground stations: read as pymavlink reads them, of one autopilot, damaged or not."""
 
 import contextlib
+import os
 import struct
 
 import numpy as np
@@ -16,6 +17,7 @@ from mavlink.autopilots import Autopilot
 from pymavlink import mavutil
 
 from fdi_ros.bag.reader import Recording
+from fdi_ros.bag.tlog import Tlog
 from fdi_ros.errors import BagError
 
 
@@ -28,6 +30,40 @@ def messages(path, topic):
 def written(path, data):
     path.write_bytes(data)
     return path
+
+
+def shown(path):
+    """All that an opened log says."""
+    with Recording(path) as recording:
+        said = [recording.topics, recording.texts, recording.system, recording.context]
+        batches = list(recording.batches([one.name for one in recording.topics]))
+        sent = [one.buffer.tobytes() for one in batches]
+        return repr([*said, recording.hardware_id, recording.damage.report()]), sent
+
+
+@pytest.mark.parametrize("beats", [True, False])
+def test_a_log_that_is_opened_again_says_the_same_and_another_one_its_own(
+    tmp_path, monkeypatch, beats
+):
+    """Also one of the same name, length and time of change; in the first some bytes are lost."""
+    left_out = () if beats else (0,)  # HEARTBEAT
+    data = telemetry(Autopilot("ardupilot", rates=SCALED), left_out=left_out) + b"lost"
+    path = written(tmp_path / "a.tlog", data)
+    os.utime(path, (1, 1))
+    monkeypatch.setattr(Tlog, "_read_last", (b"", {}, {}))
+    first = shown(path)
+    assert "bytes belong to no whole record" in first[0]
+    assert ("no HEARTBEAT" in first[0]) == (not beats)
+    with monkeypatch.context() as patch:
+        patch.setattr(Tlog, "_decode", None)
+        assert shown(path) == shown(path) == first
+    other = telemetry(Autopilot("ardupilot", rates=SCALED, seed=5), seconds=7.0)
+    path.write_bytes(other[: len(data)])
+    os.utime(path, (1, 1))
+    again = shown(path)
+    assert again[1] != first[1]
+    monkeypatch.setattr(Tlog, "_read_last", (b"", {}, {}))
+    assert shown(path) == again
 
 
 @pytest.mark.parametrize("version", [1, 2])
