@@ -1,8 +1,8 @@
 # make help lists what there is; another interpreter: make test PYTHON=python3.12
 PYTHON ?=
 ARGS ?=
-# Test processes; each takes a ROS domain of its own. One more than cores: tests of nodes mostly wait.
-WORKERS ?= $(shell expr $$(nproc) + 1)
+# Test processes; each takes a ROS domain of its own. Two more than cores: tests of nodes mostly wait.
+WORKERS ?= $(shell expr $$(nproc) + 2)
 # Only every so many of the tests of make coverage.
 EVERY ?= 1
 # Cases of make fuzz.
