@@ -178,7 +178,9 @@ class Episode:
     sets: int = 1
     """Number of sets that came and went, and are one fault of the units in them."""
     longest_s: float | None = None
-    """Length of the longest of these sets, s. None: there is only one."""
+    """Length of the longest of these sets, s. None: there is only one, and no noise follows it."""
+    noisy_from_s: float | None = None
+    """Begin of the noise of the whole unit that belongs to the fault, s. None: no such noise."""
     halves: tuple[Episode, ...] = ()
     """Episodes of gyros and of accelerometers that are one fault of their unit. Empty: a fault of one
     kind of sensor. The halves have the candidates."""
@@ -430,6 +432,8 @@ def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
     until = "" if one.stands else f" to {one.end_s:.3f} s"
     if one.sets > 1:
         until += f", {one.sets} times"
+    if one.noisy_from_s is not None:
+        until += f", as noise from {one.noisy_from_s:.3f} s"
     about = _about(one, unit)
     before = _before(one)
     if not before and one.since_s - one.start_s >= LEAST_BEFORE:
@@ -537,7 +541,7 @@ def _about(one: Episode, unit: Unit) -> str:
 
 def _before(one: Episode) -> str:
     """Return the candidates of earlier steps: those of the first, and of the last if few and others."""
-    if one.sets > 1:
+    if one.sets > 1 or one.noisy_from_s is not None:
         return ""
     # A channel that was the only candidate, but not yet confirmed, is no step of its own.
     earlier = [step for step in one.steps[:-1] if step.channels != one.channels]

@@ -5,16 +5,24 @@
 
 The error of a unit that oscillates in its mounting changes its sign, so evidence for a
 single channel does not last. The monitor declares a set of the unit, withdraws it, and
-declares it again, for as long as the unit is loose.
+declares it again, for as long as the unit is loose. Once the oscillation is learned as
+noise, no set is declared any more: the noise of the unit is the rest of that fault.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from fdi_ros.replay.episodes import MOST_STEPS, Episode, Step, episode_words
+from fdi_ros.monitor.soundness import LEAST_NOISY_S
+from fdi_ros.replay.episodes import (
+    MOST_STEPS,
+    Episode,
+    Step,
+    Stretch,
+    episode_words,
+)
 
 RECURS_WITHIN = 2.0
 """Longest time between two sets of one fault, s: some swings of a loose unit."""
@@ -23,6 +31,25 @@ LEAST_SETS = 3
 EXPLAINS = 0.9
 """Share of the time of all sets for which a unit must have been in them to explain them.
 As evidence fades, a set may be one of healthy channels for some samples."""
+STILL_NOISY = 1.0
+"""Noise that ends this close to the end of a stretch, s, lasts to its end. Noise of a
+line falls below its limit for moments."""
+LEAST_NOISY_CHANNELS = 2
+"""Number of channels of a unit whose noise is that of the unit. One is a noisy channel."""
+
+
+@dataclass(frozen=True)
+class NoisyTime:
+    """A time in which a channel was much noisier than before, and than the other units."""
+
+    channel: str
+    """Name of the channel."""
+    measured_in: str
+    """Unit of its figures: rad/s of a gyro, m/s^2 of an accelerometer."""
+    since_s: float
+    """Begin, s from the first message."""
+    until_s: float
+    """End, s from the first message."""
 
 
 def join_recurring(
@@ -44,6 +71,107 @@ def join_recurring(
             run.append(one)
         joined += _told(run, unit_of)
     return sorted(joined, key=lambda one: (one.start_s, one.since_s))
+
+
+def join_noise(
+    episodes: Sequence[Episode],
+    noisy: Sequence[NoisyTime],
+    stretches: Sequence[Stretch],
+    unit_of: Mapping[str, str],
+) -> list[Episode]:
+    """Join sets of a unit with its noise that follows, and with sets in that time.
+
+    Evidence does not separate two parallel units, but noise that the other units do not
+    show is of one unit. ``unit_of``: unit of each channel. The episodes are in the order
+    of their starts.
+    """
+    joined: list[Episode] = []
+    left = list(episodes)
+    while left:
+        one = left.pop(0)
+        end = stretches[one.stretch - 1].end_s if one.stretch <= len(stretches) else 0.0
+        times = _noise_after(one, noisy, unit_of)
+        if not times:
+            joined.append(one)
+            continue
+        run = [one]
+        until = min(max(time.until_s for time in times), end)
+        for later in list(left):
+            if later.measured_in == one.measured_in and _is_inside(
+                later, until, run, unit_of
+            ):
+                run.append(later)
+                left.remove(later)
+        joined.append(_noisy_unit(run, times, until, end, unit_of))
+    return joined
+
+
+def _noise_after(
+    one: Episode, noisy: Sequence[NoisyTime], unit_of: Mapping[str, str]
+) -> list[NoisyTime]:
+    """Return the noise of the one unit behind an episode that begins in it or soon after."""
+    if one.state != "AMBIGUOUS":
+        return []
+    after = [
+        time
+        for time in noisy
+        if time.measured_in == one.measured_in
+        and time.until_s - time.since_s >= LEAST_NOISY_S
+        and one.start_s <= time.since_s <= one.end_s + RECURS_WITHIN
+    ]
+    by_unit: dict[str, list[NoisyTime]] = {}
+    for time in after:
+        by_unit.setdefault(unit_of[time.channel], []).append(time)
+    if len(by_unit) != 1:
+        return []
+    (unit,) = by_unit
+    channels = {time.channel for time in after}
+    if len(channels) < LEAST_NOISY_CHANNELS or unit not in _units_behind(
+        [one], unit_of
+    ):
+        return []
+    return after
+
+
+def _is_inside(
+    later: Episode, until: float, run: Sequence[Episode], unit_of: Mapping[str, str]
+) -> bool:
+    """Whether a later set is one more of a unit that is noisy until a time, s."""
+    return (
+        later.state == "AMBIGUOUS"
+        and later.stretch == run[0].stretch
+        and later.start_s <= until + RECURS_WITHIN
+        and bool(_units_behind(run, unit_of) & _units_behind([later], unit_of))
+    )
+
+
+def _noisy_unit(
+    run: Sequence[Episode],
+    times: Sequence[NoisyTime],
+    until: float,
+    end: float,
+    unit_of: Mapping[str, str],
+) -> Episode:
+    """Return the episode of a unit whose sets, in a run, passed into its noise.
+
+    The noise lasts until a time, s, in a stretch with that end, s.
+    """
+    unit = unit_of[times[0].channel]
+    shown = {time.channel for time in times}
+    shown |= {name for one in run for name in one.channels if unit_of[name] == unit}
+    whole = _whole(run)
+    last = max(until, run[-1].end_s)
+    whole = replace(
+        whole,
+        channels=tuple(name for name in unit_of if name in shown),
+        who=unit,
+        end_s=last,
+        stands=run[-1].stands or end - last < STILL_NOISY,
+        candidates=tuple(one for one in whole.candidates if one.channel in shown),
+        apart=None,
+        noisy_from_s=min(time.since_s for time in times),
+    )
+    return replace(whole, words=episode_words(whole))
 
 
 def _recurs(run: Sequence[Episode], one: Episode, unit_of: Mapping[str, str]) -> bool:
@@ -69,22 +197,33 @@ def _told(run: Sequence[Episode], unit_of: Mapping[str, str]) -> Sequence[Episod
     if len(run) < LEAST_SETS or not own:
         return run
     widest = max(own, key=lambda step: len(step.channels))
-    longest = max(run, key=lambda one: one.end_s - one.since_s)
-    steps = [step for one in run for step in one.steps]
-    last_alarms = [one.evidence.last_alarm_s for one in run]
-    ratios = [one.evidence.ratio for one in run]
+    whole = _whole(run)
     whole = replace(
-        longest,
+        whole,
         channels=widest.channels,
         who=widest.who,
+        candidates=tuple(
+            one for one in whole.candidates if one.channel in widest.channels
+        ),
+    )
+    return [replace(whole, words=episode_words(whole))]
+
+
+def _whole(run: Sequence[Episode]) -> Episode:
+    """Return the longest set of a run with times, steps and evidence of all of them."""
+    longest = max(run, key=_longest)
+    steps = tuple(step for one in run for step in one.steps)
+    if len(steps) > MOST_STEPS:
+        steps = (*steps[: MOST_STEPS - 1], steps[-1])
+    last_alarms = [one.evidence.last_alarm_s for one in run]
+    ratios = [one.evidence.ratio for one in run]
+    return replace(
+        longest,
         start_s=run[0].start_s,
         since_s=run[0].start_s,
         end_s=run[-1].end_s,
         stands=run[-1].stands,
-        steps=(*steps[: MOST_STEPS - 1], steps[-1]),
-        candidates=tuple(
-            one for one in longest.candidates if one.channel in widest.channels
-        ),
+        steps=steps,
         evidence=replace(
             run[0].evidence,
             ratio=max((one for one in ratios if one is not None), default=None),
@@ -93,10 +232,14 @@ def _told(run: Sequence[Episode], unit_of: Mapping[str, str]) -> Sequence[Episod
                 (one for one in last_alarms if one is not None), default=None
             ),
         ),
-        sets=len(run),
-        longest_s=longest.end_s - longest.since_s,
+        sets=sum(one.sets for one in run),
+        longest_s=_longest(longest),
     )
-    return [replace(whole, words=episode_words(whole))]
+
+
+def _longest(one: Episode) -> float:
+    """Return the length of an episode, or of the longest set in it, s."""
+    return one.end_s - one.since_s if one.longest_s is None else one.longest_s
 
 
 def _units_behind(

@@ -46,7 +46,7 @@ from fdi_ros.replay.health import (
 )
 from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
-from fdi_ros.replay.recurring import join_recurring
+from fdi_ros.replay.recurring import NoisyTime, join_noise, join_recurring
 from fdi_ros.replay.span_means import SpanMeans, Temperature, with_warming
 from fdi_ros.replay.summary import (
     AutopilotText,
@@ -293,7 +293,8 @@ class Judge(Walk):
                 half.geometry.channel_names, half.geometry.unit_of, strict=True
             )
         }
-        story = _joined([one.story(end) for one in self._recorders], units)
+        stories = [one.story(end) for one in self._recorders]
+        story = _joined(stories, units, self._noisy_times(status))
         episodes = []
         for one in story.episodes:
             known = [
@@ -395,6 +396,16 @@ class Judge(Walk):
                 unchecked=unchecked,
             )
 
+    def _noisy_times(self, status: Status) -> list[NoisyTime]:
+        """Return the longest and the last time of noise of each channel."""
+        time = self.evaluation.time
+        return [
+            NoisyTime(one.name, one.unit, time(spell.since), time(spell.until))
+            for one in status.channels
+            for spell in dict.fromkeys((one.longest_noisy, one.last_noisy))
+            if spell.since
+        ]
+
     def _usual_noise(self) -> list[float | None]:
         """Return the usual noise of each channel, rad/s. None: never OK."""
         return [finite(noise) for one in self._noise for noise in one.result().tolist()]
@@ -438,16 +449,20 @@ class Judge(Walk):
         return float(1e9 / step[np.searchsorted(np.cumsum(count), count.sum() / 2)])
 
 
-def _joined(stories: Sequence[Story], unit_of: Mapping[str, str]) -> Story:
+def _joined(
+    stories: Sequence[Story], unit_of: Mapping[str, str], noisy: Sequence[NoisyTime]
+) -> Story:
     """Merge the stories of gyros and accelerometers, with the stretches of the gyros.
 
-    ``unit_of``: unit of each channel.
+    ``unit_of``: unit of each channel. ``noisy``: times of noise of all channels.
     """
     episodes = [one for story in stories for one in story.episodes]
     episodes.sort(key=lambda one: (one.start_s, one.since_s))
+    joined = join_recurring(episodes, unit_of)
+    joined = join_noise(joined, noisy, stories[0].stretches, unit_of)
     return Story(
         stories[0].stretches,
-        tuple(join_halves(join_recurring(episodes, unit_of), unit_of)),
+        tuple(join_halves(joined, unit_of)),
         sum(story.more for story in stories),
     )
 

@@ -219,7 +219,11 @@ def _faulty_sentences(
     if others:
         sentences.append(f"Also {first_of(list(others), MOST_TOLD)}.")
     sentences += [one.sentence for one in set_clocks(judgement)]
-    sentences += [f"{one}." for one in noise_behind(judgement)[:MOST_CONCERNS]]
+    noise = [f"{one}." for one in noise_behind(judgement)[:MOST_CONCERNS]]
+    if not noise and first.noisy_from_s is not None:
+        begins = f"From {first.noisy_from_s:.1f} s on"
+        noise = [f"{begins} the whole unit is noisy, as a loose one is."]
+    sentences += noise
     if frozen and judgement.monitor.note:
         sentences.append(f"At the end, {judgement.monitor.note}.")
     return " ".join([*sentences, _advice(judgement, lasting)])
@@ -253,9 +257,10 @@ def _advice(judgement: Judgement, faulty: Sequence[Episode]) -> str:
     others = [units for units in doubted if named.keys().isdisjoint(units)]
     if named:
         are = "is" if len(named) == 1 else "are"
-        work = (
-            "checked for a loose mounting" if _shakes(judgement, named) else "checked"
+        is_loose = _shakes(judgement, named) or any(
+            one.noisy_from_s is not None for one in faulty
         )
+        work = "checked for a loose mounting" if is_loose else "checked"
         units = [name for name in dict.fromkeys(unit_of.values()) if name in named]
         steps = [f"{listed(units)} {are} {work} or replaced"]
     else:
@@ -329,7 +334,8 @@ def _who(one: Episode) -> str:
         return one.who
     parts = [name.rpartition(".") for name in one.channels]
     units = {unit for unit, _, _ in parts}
-    if one.sets > 1 and len(units) == 1 and "" not in units:
+    is_loose = one.sets > 1 or one.noisy_from_s is not None
+    if is_loose and len(units) == 1 and "" not in units:
         return parts[0][0]
     if one.state == "AMBIGUOUS":
         return _one_of(one) if len(parts) > 1 else f"{one.who} (not confirmed)"

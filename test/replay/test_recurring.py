@@ -7,8 +7,22 @@ from dataclasses import replace
 
 import pytest
 
-from fdi_ros.replay.episodes import Episode, Evidence, RateMeanwhile, Step, join_halves
-from fdi_ros.replay.recurring import LEAST_SETS, RECURS_WITHIN, join_recurring
+from fdi_ros.monitor.soundness import LEAST_NOISY_S
+from fdi_ros.replay.episodes import (
+    Episode,
+    Evidence,
+    RateMeanwhile,
+    Step,
+    Stretch,
+    join_halves,
+)
+from fdi_ros.replay.recurring import (
+    LEAST_SETS,
+    RECURS_WITHIN,
+    NoisyTime,
+    join_noise,
+    join_recurring,
+)
 
 UNIT_OF = {
     f"imu_{unit}.{kind}{axis}": f"imu_{unit}"
@@ -103,3 +117,54 @@ def test_gyros_and_accelerometers_that_come_and_go_are_one():
     assert len(join_halves(join_recurring([*gyros, single], UNIT_OF), UNIT_OF)) == 1
     # Beside a fault of a single channel it is another one.
     assert len(join_halves([gyros[0], single], UNIT_OF)) == 2
+
+
+STRETCHES = [
+    Stretch(0.0, 40.0, 4000, 4000, 39.0),
+    Stretch(60.0, 90.0, 3000, 3000, 29.0),
+]
+
+
+def noise(*channels, since=7.0, until=39.9, half="rad/s"):
+    return [NoisyTime(name, half, since, until) for name in channels]
+
+
+def test_a_set_that_passes_into_noise_of_its_unit_is_one_episode_of_the_unit():
+    """A later set within that noise is of it, too."""
+    run = [episode(6.0, last=("imu_3.x",)), episode(20.0, length=0.3)]
+    (one,) = join_noise(run, noise("imu_3.x", "imu_3.z"), STRETCHES, UNIT_OF)
+    assert (one.who, one.channels, one.sets) == ("imu_3", GYROS, 2)
+    assert (one.start_s, one.end_s, one.stands) == (6.0, 39.9, True)
+    assert (one.is_brief, one.noisy_from_s) == (True, 7.0)
+    assert one.words.startswith(
+        "imu_3 AMBIGUOUS from 6.000 s, 2 times, as noise from 7.000 s"
+    )
+    ends = noise("imu_3.x", "imu_3.z", until=15.0)
+    one, other = join_noise(run, ends, STRETCHES, UNIT_OF)
+    assert (one.end_s, one.stands, one.sets) == (15.0, False, 1)
+    assert other == run[1]
+
+
+def test_noise_tells_which_unit_of_a_set_is_loose():
+    every = tuple(name for name in UNIT_OF if "accel" not in name)
+    found = noise("imu_2.x", "imu_2.y")
+    (one,) = join_noise([episode(6.0, every)], found, STRETCHES, UNIT_OF)
+    assert (one.who, one.channels) == ("imu_2", ("imu_2.x", "imu_2.y", "imu_2.z"))
+
+
+@pytest.mark.parametrize(
+    ("one", "found"),
+    [
+        (episode(6.0), noise("imu_3.x")),
+        (episode(6.0), noise("imu_2.x", "imu_2.y")),
+        (episode(6.0), noise("imu_3.x", "imu_3.y", "imu_2.x")),
+        (episode(6.0), noise("imu_3.x", "imu_3.y", since=6.4 + RECURS_WITHIN + 0.1)),
+        (episode(6.0), noise("imu_3.x", "imu_3.y", since=2.0)),
+        (episode(6.0), noise("imu_3.x", "imu_3.y", until=6.9 + LEAST_NOISY_S)),
+        (episode(6.0), noise(*FORCES, half="m/s^2")),
+        (episode(6.0, state="FAULTY"), noise("imu_3.x", "imu_3.y")),
+    ],
+)
+def test_noise_of_one_channel_or_another_unit_or_time_joins_nothing(one, found):
+    """A named channel stays named, whatever noise follows."""
+    assert join_noise([one], found, STRETCHES, UNIT_OF) == [one]

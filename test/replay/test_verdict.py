@@ -86,6 +86,12 @@ needs_sitl = pytest.mark.skipif(
             3,
             r"FAULTY: imu_1, all axes, from \d+\.\d s\. .* First seen at 15\.0 s\.",
         ),
+        (
+            CASES / "loose_unit.csv",
+            3,
+            r"FAULTY: imu_1 from 15\.[01] s\. imu_1 had up to \d+ times the noise of the other"
+            r" units, from 1[67]\.\d s on\. .* checked for a loose mounting or replaced\.",
+        ),
         (CASES / "mcap_message_zstd", 0, r"HEALTHY: .*9 channels"),
         (CASES / "clean.csv", 0, r"HEALTHY: "),
         (
@@ -104,6 +110,14 @@ def test_the_first_line_of_a_case(file, code, sentence, fdi, tmp_path):
     assert said.code == code
     verdict = json.loads(told.read_text())["verdict"]
     assert (verdict["words"], verdict["word"]) == (first, first.partition(":")[0])
+
+
+@needs_cases
+def test_a_loose_unit_is_one_episode_to_the_end():
+    (one,) = replay(CASES / "loose_unit.csv").story.declared
+    assert (one.who, one.stands) == ("imu_1", True)
+    assert one.channels == ("imu_1.x", "imu_1.y", "imu_1.z")
+    assert (one.start_s, one.end_s) == pytest.approx((15.1, 40.0), abs=0.1)
 
 
 @needs_cases
