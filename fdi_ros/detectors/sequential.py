@@ -47,6 +47,7 @@ from fdi_ros.estimator.blocks import (
     predict_innovation_covariance,
     update_angular_acceleration,
     update_excess,
+    update_fast_motion,
     update_incoherent,
 )
 from fdi_ros.estimator.delays import (
@@ -212,6 +213,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     update_angular_acceleration(params, kf)
     weight = judge_block(params, kf)
     update_incoherent(params, kf)
+    update_fast_motion(kf)
     if kf.judged:
         update_from_block(params, kf, state.scales, learns)
         keep_information(params, state)

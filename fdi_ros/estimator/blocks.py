@@ -25,8 +25,11 @@ from fdi_ros.estimator.error_states import (
     update,
 )
 from fdi_ros.estimator.estimator import (
+    BLOCK_TIME,
+    FAST_STAGES,
     LEAST_NOISE_SHARE,
     REST_BLOCKS,
+    SLOW_MOTION,
     Constants,
     Estimator,
     update_weights,
@@ -42,6 +45,8 @@ turns. If noise passed for motion, delays of zero would be learned."""
 # Smallest share of a channel's error in its residual. Below it no method judges the
 # channel.
 LEAST_REDUNDANCY = 1e-3
+FAST_GAIN = 1.0 - math.exp(-2.0 * math.pi * SLOW_MOTION * BLOCK_TIME)
+"""Gain of one stage of the high pass, per block."""
 PEAK = 0.8  # factor per block on the peaks of motion: they fade within half a second
 
 
@@ -215,6 +220,43 @@ def update_incoherent(params: Constants, kf: Estimator) -> None:
 
 
 @compiled
+def update_fast_motion(kf: Estimator) -> None:
+    """Update how much of the squared angular acceleration is faster than `SLOW_MOTION`."""
+    share = 1.0 / REST_BLOCKS
+    fast = total = 0.0
+    for a in range(3):
+        value = kf.rates[1, a]
+        for stage in range(FAST_STAGES):
+            kf.slow_rates[stage, a] += FAST_GAIN * (value - kf.slow_rates[stage, a])
+            value -= kf.slow_rates[stage, a]
+        change = value - kf.fast_rate[a]
+        kf.fast_rate[a] = value
+        fast += change * change
+        change = kf.rates[1, a] - kf.rates[2, a]
+        total += change * change
+    square_of_span = kf.span * kf.span
+    kf.fast_square += share * (fast / square_of_span - kf.fast_square)
+    kf.all_square += share * (total / square_of_span - kf.all_square)
+
+
+@compiled
+def contradiction(params: Constants, kf: Estimator, u: int) -> float:
+    """Variance of the delay that the channels of unit u show beside one delay of them all, s^2.
+
+    Vibration reaches every axis of a unit with a phase of its own, which looks like a
+    delay of that axis alone.
+    """
+    product = turns = squares = 0.0
+    for i in range(params.sensors.n):
+        if params.unit[i] == u:
+            product += kf.deviation_turn[i]
+            turns += kf.turn_square[i]
+            squares += kf.deviation_square[i]
+    turns = max(turns, 1e-12)
+    return max(squares - product * product / turns, 0.0) / turns
+
+
+@compiled
 def unlearnable(error: float, inside: float, signal_square: float) -> float:
     """Return the variance of a scale error that no number of samples removes.
 
@@ -332,6 +374,11 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
     for i in range(params.sensors.n):
         keep_speed_variance(params, kf, i)
         keep_delay_variance(params, kf, i, vibration)
+    share = min(kf.fast_square / max(kf.all_square, 1e-12), 1.0)
+    for u in range(1, params.units):
+        place = params.layout.delays[u]
+        together = contradiction(params, kf, u) + contradiction(params, kf, 0)
+        kf.least_variance[place] = max(kf.least_variance[place], 0.5 * share * together)
 
 
 @compiled
