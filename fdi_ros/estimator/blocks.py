@@ -240,6 +240,17 @@ def update_fast_motion(kf: Estimator) -> None:
 
 
 @compiled
+def fast_share(kf: Estimator) -> float:
+    """Return the share of the squared angular acceleration that is faster than `SLOW_MOTION`.
+
+    The change between two blocks has four times the noise variance of the change over
+    two intervals, about each of three axes.
+    """
+    noise = 12.0 * kf.turn_noise
+    return max(kf.fast_square - noise, 0.0) / max(kf.all_square, 1e-12)
+
+
+@compiled
 def contradiction(params: Constants, kf: Estimator, u: int) -> float:
     """Variance of the delay that the channels of unit u show beside one delay of them all, s^2.
 
@@ -374,7 +385,7 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
     for i in range(params.sensors.n):
         keep_speed_variance(params, kf, i)
         keep_delay_variance(params, kf, i, vibration)
-    share = min(kf.fast_square / max(kf.all_square, 1e-12), 1.0)
+    share = fast_share(kf)
     for u in range(1, params.units):
         place = params.layout.delays[u]
         together = contradiction(params, kf, u) + contradiction(params, kf, 0)

@@ -70,7 +70,8 @@ enters the next."""
 SLOW_MOTION = 1.0
 """Frequency up to which all units of a body move alike, Hz. Mounts and frames swing from 2 Hz on."""
 FAST_STAGES = 4
-"""Stages of the high pass above `SLOW_MOTION`. It takes 0.01 % of the energy at 0.35 Hz, 6 % at 1 Hz and 41 % at 2 Hz."""
+"""Stages of the high pass above `SLOW_MOTION`. They leave 0.01 % of the energy at 0.35 Hz,
+6 % at 1 Hz and 41 % at 2 Hz."""
 FEWEST_BLOCKS = 3  # consecutive blocks from which the angular acceleration follows
 REST_BLOCKS = round(1.0 / BLOCK_TIME)  # blocks without motion that are rest: a second
 BLOCKS_PER_COARSE = round(LONG_TIME / BLOCK_TIME)
@@ -261,13 +262,11 @@ class Estimator:
     turn_square: Channels
     # variance of that deviation, halved, beside what a delay explains, (rad/s)^2
     incoherent: Channels
-    # Of the last blocks: state of the high pass, rad/s; the fast part of the rate, rad/s;
-    # and the mean squares over a second of the angular acceleration of that part and of
-    # all, (rad/s^2)^2
+    # state of each stage of the high pass above `SLOW_MOTION`, rad/s
     slow_rates: Annotated[NDArray[np.float64], "f8", (FAST_STAGES, 3)]
-    fast_rate: Vector
-    fast_square: Real
-    all_square: Real
+    fast_rate: Vector  # what it leaves of the rate of the block before, rad/s
+    fast_square: Real  # mean square of the change of that in a second, (rad/s^2)^2
+    all_square: Real  # mean square of the change of the rate, (rad/s^2)^2
     turning: Flag  # the angular acceleration exceeds noise
     shaken: Real  # square of the acceleration that blocks are too slow for, (rad/s^2)^2
     usual_shaken: Real  # its average in the last second, (rad/s^2)^2

@@ -487,6 +487,64 @@ def test_in_turns_white_noise_has_no_tails_and_a_fault_is_declared_soon():
     assert np.mean(delays) < 5.0 * BOUND[8.0]
 
 
+def slow_turns(seconds, rng):
+    """Turns of 0.2 to 0.6 rad/s that begin at 8 s, at 0.1 to 0.6 Hz about each axis."""
+    hertz = rng.uniform(0.1, 0.6, 3)
+    phase = rng.uniform(0.0, 2 * np.pi, 3)
+    size = rng.uniform(0.2, 0.6)
+    begins = np.clip((seconds - 8.0) / 2.0, 0.0, 1.0)[:, None]
+    return size * begins * np.sin(2 * np.pi * np.outer(seconds, hertz) + phase)
+
+
+@pytest.mark.parametrize("size", [0.05, 0.3])
+@pytest.mark.parametrize("share", [0.15, 2.0])
+def test_vibration_with_a_phase_of_its_own_on_each_axis_is_no_delay(size, share):
+    """At one frequency a phase is a delay, but each axis of a unit shows another one.
+
+    Gains and phases of the units differ by this share, or by anything.
+    """
+    seconds = np.arange(0.0, 60.0, 1.0 / RATE)
+    pipeline = Pipeline.from_config(parallel(2, detector__name="sequential"))
+    errors = []
+    for seed in range(16):
+        rng = np.random.default_rng([seed, 48])
+        late = rng.choice([-0.004, 0.0, 0.004])
+        hertz = rng.uniform(2.0, 12.0)
+        z = SIGMA * white(seed, len(seconds))
+        seed_of_turns = rng.integers(1 << 30)
+        for unit, delay in enumerate((0.0, late)):
+            t = seconds - delay
+            gain = 1.0 + 0.15 * rng.standard_normal(3)
+            phase = share * rng.standard_normal(3)
+            shaken = size * gain * np.sin(2 * np.pi * hertz * t[:, None] + phase)
+            turns = slow_turns(t, np.random.default_rng(seed_of_turns))
+            z[:, 3 * unit : 3 * unit + 3] += turns + (t > 8.0)[:, None] * shaken
+        pipeline.restart()
+        pipeline.process(stamped(seconds, z))
+        status = pipeline.status()
+        errors.append(abs(status.delays[1] - late) / status.delay_std[1])
+    assert max(errors) < 3.0
+
+
+@pytest.mark.parametrize("late", [0.0, 0.005, 0.02])
+@pytest.mark.parametrize("hertz", [0.6, 1.5, 3.0])
+def test_a_delay_is_learned_within_seconds_of_motion(late, hertz):
+    """Units that see one motion show their delay, however quick the motion is."""
+    seconds = np.arange(0.0, 14.0, 1.0 / RATE)
+
+    def rate(t):
+        turn = np.sin(2 * np.pi * hertz * np.outer(t, [1.0, 0.8, 1.2]))
+        return 0.5 * np.clip(t - 6.0, 0.0, 1.0)[:, None] * turn
+
+    z = np.hstack([rate(seconds), rate(seconds - late)])
+    z += SIGMA * white(6, len(seconds))
+    pipeline = Pipeline.from_config(parallel(2, detector__name="sequential"))
+    pipeline.process(stamped(seconds, z))
+    status = pipeline.status()
+    assert abs(status.delays[1] - late) < 3.0 * status.delay_std[1]
+    assert status.delay_std[1] < 0.0015
+
+
 def flown_with_a_hole(units, hole, fault, seed):
     """Parallel units in motion, no samples from 12 s on for so many s, in which imu_2.y comes to be off."""
     rng, seconds = (
