@@ -240,14 +240,14 @@ def update_fast_motion(kf: Estimator) -> None:
 
 
 @compiled
-def fast_share(kf: Estimator) -> float:
+def fast_share(params: Constants, kf: Estimator) -> float:
     """Return the share of the squared angular acceleration that is faster than `SLOW_MOTION`.
 
-    The change between two blocks has four times the noise variance of the change over
-    two intervals, about each of three axes.
+    The noise that the settings expect is no motion. The learned noise contains vibration.
     """
-    noise = 12.0 * kf.turn_noise
-    return max(kf.fast_square - noise, 0.0) / max(kf.all_square, 1e-12)
+    noise = fused_variance(params, kf, params.expected) / params.length
+    change = 6.0 * noise / (kf.span * kf.span)  # of two blocks, about three axes
+    return max(kf.fast_square - change, 0.0) / max(kf.all_square, 1e-12)
 
 
 @compiled
@@ -385,7 +385,7 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
     for i in range(params.sensors.n):
         keep_speed_variance(params, kf, i)
         keep_delay_variance(params, kf, i, vibration)
-    share = fast_share(kf)
+    share = fast_share(params, kf)
     for u in range(1, params.units):
         place = params.layout.delays[u]
         together = contradiction(params, kf, u) + contradiction(params, kf, 0)
