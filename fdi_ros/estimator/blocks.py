@@ -373,6 +373,17 @@ def keep_delay_variance(
 
 
 @compiled
+def keep_contradicted_delays(params: Constants, kf: Estimator) -> None:
+    """Raise the least variance of delays in fast motion that the axes of a unit contradict."""
+    share = 0.5 * fast_share(params, kf)
+    of_first = contradiction(params, kf, 0)
+    for u in range(1, params.units):
+        place = params.layout.delays[u]
+        least = share * (of_first + contradiction(params, kf, u))
+        kf.least_variance[place] = max(kf.least_variance[place], least)
+
+
+@compiled
 def update_least_variances(params: Constants, kf: Estimator) -> None:
     """Find the variance that each state of the motion keeps at least. Biases keep none."""
     for r in range(params.layout.count):
@@ -385,11 +396,8 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
     for i in range(params.sensors.n):
         keep_speed_variance(params, kf, i)
         keep_delay_variance(params, kf, i, vibration)
-    share = fast_share(params, kf)
-    for u in range(1, params.units):
-        place = params.layout.delays[u]
-        together = contradiction(params, kf, u) + contradiction(params, kf, 0)
-        kf.least_variance[place] = max(kf.least_variance[place], 0.5 * share * together)
+    if params.units > 1:
+        keep_contradicted_delays(params, kf)
 
 
 @compiled
