@@ -10,7 +10,7 @@ Two of three IMUs can be wrong alike: both stand still, or both are remembered a
 they outvote the third on an axis only if both have moved of late (`MOVES`), if each is trusted
 (`TRUSTED`) or has moved since it was found bad on another axis, and if
 the monitor has no doubt about them that it does not have about the third as well. Two that
-were both taken out in this flight outvote one that was not only once both are back, and have
+were both taken out in this flight outvote one that was not only once one of them is back, and has
 agreed in turns about all axes.
 """
 
