@@ -373,17 +373,6 @@ def keep_delay_variance(
 
 
 @compiled
-def keep_contradicted_delays(params: Constants, kf: Estimator) -> None:
-    """Raise the least variance of delays in fast motion that the axes of a unit contradict."""
-    share = 0.5 * fast_share(params, kf)
-    of_first = contradiction(params, kf, 0)
-    for u in range(1, params.units):
-        place = params.layout.delays[u]
-        least = share * (of_first + contradiction(params, kf, u))
-        kf.least_variance[place] = max(kf.least_variance[place], least)
-
-
-@compiled
 def update_least_variances(params: Constants, kf: Estimator) -> None:
     """Find the variance that each state of the motion keeps at least. Biases keep none."""
     for r in range(params.layout.count):
@@ -396,8 +385,6 @@ def update_least_variances(params: Constants, kf: Estimator) -> None:
     for i in range(params.sensors.n):
         keep_speed_variance(params, kf, i)
         keep_delay_variance(params, kf, i, vibration)
-    if params.units > 1:
-        keep_contradicted_delays(params, kf)
 
 
 @compiled
@@ -428,6 +415,9 @@ def learn(params: Constants, kf: Estimator, weight: float) -> None:
             kf.block_parity, params.sensors, kept, kf.matrix, prior_information
         )
     update_least_variances(params, kf)
+    for u in range(1, params.units):
+        place = layout.delays[u]
+        kf.delay_variance_before[u] = kf.states.p[place, place]
     update(
         layout,
         kf.states,
@@ -437,6 +427,26 @@ def learn(params: Constants, kf: Estimator, weight: float) -> None:
         weight,
         kf.least_variance,
     )
+    follow_taught_delays(params, kf)
+
+
+@compiled
+def follow_taught_delays(params: Constants, kf: Estimator) -> None:
+    """Follow the part of each delay that fast motion has taught in which the axes of a unit contradict.
+
+    A block leaves a share g of a delay x as it was: x <- g x + (1 - g) d. If d is wrong
+    by the same amount in all blocks of a vibration, its error follows the same equation.
+    """
+    if kf.rest or params.units < 2:
+        return
+    share = 0.5 * fast_share(params, kf)
+    of_first = contradiction(params, kf, 0)
+    for u in range(1, params.units):
+        place = params.layout.delays[u]
+        before = kf.delay_variance_before[u]
+        kept = kf.states.p[place, place] / before if before > 0.0 else 1.0
+        wrong = math.sqrt(share * (of_first + contradiction(params, kf, u)))
+        kf.taught_delay[u] = kept * kf.taught_delay[u] + (1.0 - kept) * wrong
 
 
 @compiled

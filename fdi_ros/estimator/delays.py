@@ -67,6 +67,7 @@ def transfer_delays(params: Constants, kf: Estimator) -> bool:
         delay = kf.states.x[place]
         unresolved = params.layout.prior[place] * unresolved_share(params, kf, u)
         variance = kf.states.p[place, place] + unresolved * unresolved
+        variance += kf.taught_delay[u] * kf.taught_delay[u]
         if (
             abs(delay) > LEAST_COMPENSATED_DELAY
             and delay * delay > SURE_DELAY * variance

@@ -267,6 +267,9 @@ class Estimator:
     fast_rate: Vector  # what it leaves of the rate of the block before, rad/s
     fast_square: Real  # mean square of the change of that in a second, (rad/s^2)^2
     all_square: Real  # mean square of the change of the rate, (rad/s^2)^2
+    # standard deviation of the part of each delay state that vibration may have taught, s
+    taught_delay: Units
+    delay_variance_before: Units  # of each delay state before the last block, s^2
     turning: Flag  # the angular acceleration exceeds noise
     shaken: Real  # square of the acceleration that blocks are too slow for, (rad/s^2)^2
     usual_shaken: Real  # its average in the last second, (rad/s^2)^2

@@ -467,6 +467,7 @@ def _delays(guard: Detector, begun: bool) -> tuple[Array, Array]:
     covariance = np.zeros((units, units))
     value[1:] += estimator["states"]["x"][places]
     covariance[1:, 1:] = estimator["states"]["p"][np.ix_(places, places)]
+    covariance += np.diag(estimator["taught_delay"][:units] ** 2)
     variance = (
         np.add.outer(np.diag(covariance), np.diag(covariance))
         - covariance

@@ -312,19 +312,19 @@ def flight(
             {},
             (0.0, 0.004),
             (0.0, 0.004),
-            "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms late against imu_1's",
+            "imu_2 as a whole: its stamps are 4.0 +- 0.2 ms late against imu_1's",
         ),
         (
             {},
             (0.0, -0.004),
             (0.0, -0.004),
-            "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms early against imu_1's",
+            "imu_2 as a whole: its stamps are 4.0 +- 0.2 ms early against imu_1's",
         ),
         (
             SET,
             (0.0, 0.004),
             (0.0, 0.004),
-            "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms late against imu_1's",
+            "imu_2 as a whole: its stamps are 4.0 +- 0.2 ms late against imu_1's",
         ),
         (
             THREE,
@@ -337,7 +337,7 @@ def flight(
             {**SET, "detector.name": "likelihood_ratio"},
             (0.0, 0.004),
             (0.0, 0.004),
-            "imu_2 as a whole: its stamps are 4.0 +- 0.1 ms late against imu_1's",
+            "imu_2 as a whole: its stamps are 4.0 +- 0.2 ms late against imu_1's",
         ),
     ],
 )
