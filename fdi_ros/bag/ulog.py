@@ -159,11 +159,10 @@ class Ulog(LibraryLog):
             elif one.name in _GPS_TOPICS and self.start_utc is None:
                 self.start_utc = _start_utc(one.data)
             self._take_flight(one.name, one.data)
+        joined = {source: _joined(columns) for source, columns in parts.items()}
         found = {
             source: columns
-            for source, columns in {
-                source: _joined(columns) for source, columns in parts.items()
-            }.items()
+            for source, columns in joined.items()
             if self.samples(
                 source.kind, {name: column[:0] for name, column in columns.items()}
             )
@@ -176,8 +175,11 @@ class Ulog(LibraryLog):
             else set()
         )
         self.unread = dict.fromkeys(lacking | (announced & set(_IMU_TOPICS)), _LACKS)
-        status = {one: found[one] for one in sorted(found) if one.kind == _STATUS}
-        together = _simultaneous(status)
+        # Before version 1.12 the status has no means of the rate.
+        status = {one: joined[one] for one in sorted(joined) if one.kind == _STATUS}
+        together = _simultaneous(
+            {one: columns for one, columns in status.items() if one in found}
+        )
         self.status = _status_words(status, together)
         self._take_temperatures(found)
         return _with_forces(found, _accelerometers(log)) | together

@@ -405,6 +405,17 @@ def test_of_a_default_log_of_px4_of_any_length_the_means_are_said(
     assert "imu_1 up to 41 degC, 3 errors" in out
 
 
+def test_the_status_of_an_older_px4_without_means_is_said(tmp_path, refused):
+    made = units(2, seconds=6, rate=1.0)
+    path = write_ulog(tmp_path / "log.ulg", made, kind="vehicle_imu_status")
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b" mean_gyro;", b" some_gyro;"))
+    said = refused("inspect", path)
+    assert "imu_0 up to 40 degC" in said
+    assert "imu_1 up to 41 degC, 3 errors" in said
+    assert "median of" not in said
+
+
 def test_a_telemetry_log_without_heartbeat_is_read(tmp_path):
     autopilot = Autopilot("ardupilot", rates=SCALED, system=7)
     path = tmp_path / "a.tlog"
