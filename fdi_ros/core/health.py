@@ -57,6 +57,13 @@ def check(settings: PathSettings, health: Health, sample: Sample) -> None:
 
 
 @compiled
+def has_value(health: Health, i: int) -> bool:
+    """Whether channel i has a finite value in this sample."""
+    condition = health.condition[i]
+    return condition in (FINE, OUT_OF_RANGE, FROZEN)
+
+
+@compiled
 def silence_units(settings: PathSettings, health: Health) -> None:
     """Treat a unit with only non-finite values as silent.
 

@@ -38,6 +38,7 @@ from fdi_ros.core.health import (
     FINE,
     OUT_OF_RANGE,
     check,
+    has_value,
     leave_flickering,
     unit_of,
 )
@@ -51,7 +52,15 @@ from fdi_ros.core.level import update_level
 from fdi_ros.core.records import Bank, Core, OutputRow, Sample
 from fdi_ros.core.repeated import all_repeat, update_repeated, without_coarse_steps
 from fdi_ros.core.restamping import restamp
-from fdi_ros.core.states import alive, left_out, out_of_use, update_states, write_events
+from fdi_ros.core.states import (
+    STALE,
+    UNCHECKED,
+    alive,
+    left_out,
+    out_of_use,
+    update_states,
+    write_events,
+)
 from fdi_ros.core.subsets import fill_rate
 
 #: A channel is noisy from this multiple of the expected or its usual noise on: its weight
@@ -514,8 +523,19 @@ def conclude_sample(path: Path, row: int, events: NDArray[Any], count: int) -> i
     last.statistic = verdict.statistic
     last.threshold = verdict.threshold
     last.alarm = verdict.alarm
+    count_checked(core)
     update_level(core, subsets)
     return write_events(core, subsets[living], row, False, events, count)
+
+
+@compiled
+def count_checked(core: Core) -> None:
+    """Count the values of this sample whose fault the other channels could have shown."""
+    if math.isfinite(core.last.threshold):
+        for i in range(core.settings.n):
+            state = core.last.state[i]
+            if has_value(core.health, i) and state != UNCHECKED and state != STALE:
+                core.health.checked[i] += 1
 
 
 @compiled

@@ -313,6 +313,8 @@ class Health:
     # samples in each condition
     counts: Annotated[NDArray[np.int64], "i8", (len(Condition), MAX_CHANNELS)]
     samples: Counts  # samples delivered
+    # samples with a finite value in which the others could have shown a fault
+    checked: Counts
     stuck: Counts  # samples that repeated a value against the motion of the others
     noisy: Counts  # samples in which the channel was much noisier than the other units
     # recent noise relative to noise_std, slow to follow increases

@@ -99,7 +99,7 @@ class Flight:
         "names of the channels; the next three are in their order"
     )
     unchecked: tuple[float, ...] | None = _column(
-        "share of the samples in which the channel was unchecked or missing"
+        "share of the values of the channel whose fault no other channel could have shown"
     )
     noise: tuple[float, ...] | None = _column(
         "lowest noise of each gyro in one sample; gyros come first", "rad/s"

@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.model.samples import Array, Int, Mask
+from fdi_ros.model.samples import Array, Int
 from fdi_ros.monitor.soundness import (
     LEAST_DELIVERED,
     ChannelHealth,
     Concern,
     RateHealth,
     UnitHealth,
+    checked_share,
     concerns_of,
     is_declared_or_silent,
     own_noise,
@@ -48,7 +49,6 @@ MOST_RATES = 600
 """Largest number of rates of a unit, from which its usual rate follows."""
 
 _COUNTED_KINDS = ("samples", "missing", "non-finite", "out of range", "spikes")
-_UNCHECKED_STATES = (ChannelState.UNCHECKED, ChannelState.STALE)
 
 
 class _Reading(NamedTuple):
@@ -58,8 +58,8 @@ class _Reading(NamedTuple):
     """Time, s."""
     counts: NDArray[np.int64]
     """(5, n) counts of each channel, in the order of ``_COUNTED_KINDS``."""
-    unchecked: Mask
-    """(n,) channels that no other channel checks."""
+    checked: Int
+    """(n,) values of each channel whose fault the others could have shown."""
     residual: Array
     """(n,) residuals of the channels that are OK, rad/s. NaN for the others."""
     received: Int
@@ -75,18 +75,24 @@ class RecentHealth:
         self._readings: deque[_Reading] = deque(maxlen=READINGS)
         self._rates: deque[Array] = deque(maxlen=MOST_RATES)
         self._concerns: list[Concern] = []
+        self.channels: tuple[ChannelHealth, ...] = ()
+        """Health of the channels in use that are not declared faulty, by the last reading."""
 
     def add(self, status: Status, inputs: Sequence[InputStatus], at: float) -> None:
-        """Add a reading at a time, s. Earlier readings are dropped if time goes back or channels change."""
+        """Add a reading at a time, s. Earlier readings are dropped if time or counts go back or channels change."""
         reading = _reading(status, inputs, at)
         if self._readings:
             before = self._readings[-1]
-            if not at > before.at or len(before.residual) != len(reading.residual):
+            restarted = (
+                len(before.residual) != len(reading.residual)
+                or (reading.counts[0] < before.counts[0]).any()
+            )
+            if not at > before.at or restarted:
                 self._readings.clear()
         self._readings.append(reading)
         units = list(self._units(status, inputs))
-        channels = list(self._channels(status))
-        self._concerns = concerns_of(channels, units, rate=self._rate_health())
+        self.channels = tuple(self._channels(status))
+        self._concerns = concerns_of(self.channels, units, rate=self._rate_health())
 
     @property
     def concerns(self) -> list[Concern]:
@@ -99,7 +105,8 @@ class RecentHealth:
         last = self._readings[-1]
         samples, missing, non_finite, at_end, spikes = last.counts - first.counts
         total = samples + missing
-        unchecked = np.mean([one.unchecked for one in self._readings], axis=0)
+        finite = samples - non_finite
+        checked = last.checked - first.checked
         noise = self._own_noise(status)
         measured = len(self._readings) >= LEAST_READINGS
         unit_of = {name: unit.name for unit in status.units for name in unit.channels}
@@ -107,12 +114,15 @@ class RecentHealth:
             if one.is_left_out or one.state == ChannelState.AMBIGUOUS:
                 continue
             # A stream that has stalled is reported as a whole.
-            delivered = (samples[i] - non_finite[i]) / total[i] if total[i] else 1.0
+            delivered = finite[i] / total[i] if total[i] else 1.0
             noisy = self._was_noisy(status, one)
             yield ChannelHealth(
                 name=one.name,
                 unit=unit_of.get(one.name, ""),
-                checked=1.0 - float(unchecked[i]) if measured else 1.0,
+                # A stream that has stalled is reported as a whole.
+                checked=checked_share(int(checked[i]), int(finite[i]))
+                if measured and total.any()
+                else 1.0,
                 delivered=float(delivered) if measured else 1.0,
                 spikes=int(spikes[i]),
                 saturated_s=float(at_end[i]) / status.config.sample_rate,
@@ -199,7 +209,7 @@ def _reading(status: Status, inputs: Sequence[InputStatus], at: float) -> _Readi
         counts=np.array(
             [[one.counts[kind] for one in channels] for kind in _COUNTED_KINDS]
         ),
-        unchecked=np.array([one.state in _UNCHECKED_STATES for one in channels]),
+        checked=np.array([one.checked for one in channels]),
         residual=np.array(
             [
                 one.residual if one.state == ChannelState.OK else math.nan

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 DECLARED = (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
 """States of a channel in a declared fault, named or in a set."""
 LEAST_CHECKED = 0.5
-"""Share of its samples in which the others must have checked a healthy channel."""
+"""Share of its values that the others must have checked of a healthy channel."""
 LEAST_DELIVERED = 0.9
 """Share of its messages that a healthy unit delivers."""
 LEAST_MISSING_S = 1.0
@@ -75,7 +75,7 @@ class ChannelHealth:
     unit: str = ""
     """Name of its unit. Empty for a channel without a unit."""
     checked: float = 1.0
-    """Share of the samples in which the other channels checked it."""
+    """Share of its values, by `checked_share`."""
     delivered: float = 1.0
     """Share of the samples in which it gave a finite value."""
     spikes: int = 0
@@ -207,6 +207,15 @@ class Concern(NamedTuple):
     def advice(self) -> str:
         """What to do about it."""
         return self.trouble.advice(self.who)
+
+
+def checked_share(checked: int, finite: int) -> float:
+    """Return the share of the values of a channel whose fault the others could have shown.
+
+    Samples without a value of the channel do not count, so a slow unit gets the share of the
+    samples that it delivered. A channel that never delivered was not checked.
+    """
+    return checked / finite if finite else 0.0
 
 
 def advice_on(concerns: Iterable[Concern]) -> str:

@@ -100,6 +100,13 @@ class ChannelStatus:
     longest_noisy: NoisySpell = NEVER_NOISY  #: Longest spell of noise so far.
     unit: str = RATE.unit  #: rad/s of a gyro, m/s^2 of an accelerometer.
     axis: tuple[float, ...] = (0.0, 0.0, 0.0)  #: Sensitivity axis in the body.
+    #: Finite values in whose samples the other channels could have shown its fault.
+    checked: int = 0
+
+    @property
+    def finite(self) -> int:
+        """Number of its finite values."""
+        return self.counts["samples"] - self.counts["non-finite"]
 
     @property
     def is_left_out(self) -> bool:
@@ -393,6 +400,7 @@ def _channel(
         longest_noisy=_spell(health["longest_noisy"], i),
         unit=quantity.unit,
         axis=tuple(geometry.axes[i].tolist()),
+        checked=int(health["checked"][i]),
     )
 
 

@@ -255,10 +255,6 @@ GRACE = 1.0
 """Time after the end of a fault in which a declaration is still attributed to the fault, s."""
 SQUARED = 1e150
 """Values below this have finite squares, and finite sums of squares."""
-_UNCHECKED = np.isin(
-    np.arange(len(ChannelState)), [ChannelState[name] for name in UNCHECKED_STATES]
-)
-"""Whether a channel is unchecked, by its state."""
 
 
 class Followed:
@@ -354,8 +350,6 @@ class Evaluation:
         """Time of the first sample without a rate, s from the first message."""
         self._has_had_rate = False
         self._unexplained: list[StateChange] = []
-        self._unchecked = np.zeros(n)
-        """Number of samples in which each channel was unchecked."""
         self._residuals = np.zeros((2, n))
         """Sum of squared residuals and their number, for each channel while OK."""
         self._least_squares = geometry.least_squares
@@ -382,11 +376,6 @@ class Evaluation:
             int(output.alarm.sum()),
         )
         self._count_missing_rates(output)
-        unchecked = [
-            _UNCHECKED[half.state] | ~np.isfinite(half.threshold)[:, None]
-            for half in output.halves
-        ]
-        self._unchecked += np.hstack(unchecked).sum(axis=0)
         fine = (output.state == ChannelState.OK) & (np.abs(output.residual) < SQUARED)
         self._residuals += (
             (np.where(fine, output.residual, 0.0) ** 2).sum(axis=0),
@@ -487,11 +476,6 @@ class Evaluation:
             self._unexplained.append(change)
             for one in [one for one in self.faults if one.is_active(time)]:
                 one.false.add(change.state)
-
-    @property
-    def unchecked(self) -> Array:
-        """(n,) share of the samples in which each channel was unchecked."""
-        return self._unchecked / max(1, self.samples)
 
     @property
     def residual_rms(self) -> list[float | None]:

@@ -35,7 +35,7 @@ from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.monitor.soundness import RateHealth, UnitHealth
+from fdi_ros.monitor.soundness import RateHealth, UnitHealth, checked_share
 from fdi_ros.monitor.status import Status
 from fdi_ros.replay.episodes import STRETCH_GAP, Story, join_halves, pieces
 from fdi_ros.replay.health import (
@@ -371,13 +371,13 @@ class Judge(Walk):
                 state = changes[0].before
                 reason = ""
             delivered = float(finite_values[i]) / samples
-            unchecked = float(evaluation.unchecked[i])
+            checked = checked_share(one.checked, one.finite)
             noisy = one.longest_noisy
             yield ChannelResult(
                 name=one.name,
                 unit=units[i],
                 measured_in=one.unit,
-                checked=min(1.0, (1.0 - unchecked) / delivered) if delivered else 0.0,
+                checked=checked,
                 delivered=delivered,
                 spikes=one.counts["spikes"],
                 saturated_s=float(saturated[i]) / (self.rate or math.inf),
@@ -393,7 +393,7 @@ class Judge(Walk):
                 drift=status.drift_since_rest(one),
                 scale=status.certain_scale_error(one),
                 noise=one.noise or None,
-                unchecked=unchecked,
+                unchecked=1.0 - checked,
             )
 
     def _noisy_times(self, status: Status) -> list[NoisyTime]:

@@ -46,7 +46,7 @@ class ChannelResult(ChannelHealth):
     noise: float | None
     """Its noise at the end, in ``noise.noise_std``. None: not measured."""
     unchecked: float
-    """Share of all samples in which no other channel checked it."""
+    """Share of its values whose fault no other channel could have shown: 1 less `checked`."""
 
 
 @dataclass(frozen=True)

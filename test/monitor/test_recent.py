@@ -13,11 +13,13 @@ from monitor.streams import RATE, SIGMA, parallel, stream, struck
 from numpy.typing import NDArray
 
 from fdi_ros.core.states import ChannelState
+from fdi_ros.faults.fault import Injector
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.diagnostics import InputStatus, Level, StatusLine, describe
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.recent import RecentHealth
 from fdi_ros.monitor.soundness import LEAST_NOISY_S, Word, live_word
+from fdi_ros.replay.run import Judge
 
 SECOND = round(RATE)
 
@@ -127,6 +129,28 @@ def test_a_declared_fault_is_faulty_and_what_is_unchecked_cannot_be_told():
     assert last["monitor"].value("verdict") == "FAULTY"
     lines = describe(Pipeline(parallel(2)).status())
     assert dict(lines[0].values)["verdict"] == "CANNOT TELL"
+
+
+@pytest.mark.parametrize(("units", "of_the_other"), [(2, 0.907), (3, 0.997)])
+def test_live_and_replay_count_the_same_values_as_checked(units, of_the_other):
+    """A unit lacks a tenth of its values: with two units, nothing checks the other one then."""
+    pipeline = Pipeline(parallel(units, detector__name="sequential"))
+    block = stream(pipeline.geometry, 50 * SECOND)
+    block.z[5 * SECOND + 9 :: 10, 3:6] = np.nan
+    injector = Injector((), pipeline.channel_names)
+    injector.start_stamp = int(block.stamp[0])
+    judge, health = Judge(pipeline, injector), RecentHealth()
+    for k in range(50):
+        judge.take(block[k * SECOND : (k + 1) * SECOND])
+        health.add(pipeline.status(), [], float(k + 1))
+    replayed = judge.judgement().monitor.channels
+    checked = {one.name: one.checked for one in replayed}
+    assert checked["imu_1.x"] == pytest.approx(of_the_other, abs=0.003)
+    assert checked["imu_2.x"] == pytest.approx(0.997, abs=0.003)
+    assert all(one.unchecked == 1.0 - one.checked for one in replayed)
+    # The first reading comes after the first second.
+    live = {one.name: one.checked for one in health.channels}
+    assert live == pytest.approx(checked, abs=0.01)
 
 
 @pytest.mark.parametrize("state", [ChannelState.FAULTY, ChannelState.AMBIGUOUS])

@@ -50,6 +50,15 @@ needs_sitl = pytest.mark.skipif(
 
 
 @needs_cases
+def test_a_unit_that_slows_to_a_third_is_checked_no_better_than_the_others():
+    """The unchecked start is a larger part of its values."""
+    channels = replay(CASES / "unit_slows_to_a_third.csv").monitor.channels
+    slow = [one.checked for one in channels if one.unit == "imu_1"]
+    others = [one.checked for one in channels if one.unit != "imu_1"]
+    assert max(slow) < min(others) - 0.02
+
+
+@needs_cases
 @pytest.mark.parametrize(
     ("file", "code", "sentence"),
     [
