@@ -450,6 +450,7 @@ class Failover:
             trip=self._vehicle.sync.trip(now),
             is_slow=self._is_slow(view, now),
             other=None if self._is_same or not self._vehicle.system else self._system,
+            is_mixed=self._vehicle.senders.are_several(now),
             is_file_fine=not self._file.trouble,
             has_lanes=self._lanes is not None,
             obeys=self._probe.obeys,

@@ -58,6 +58,7 @@ class Facts(NamedTuple):
     )
     other: int | None = None  #: System of the file, if the vehicle is another one.
     is_file_fine: bool = True  #: The file can be read and written.
+    is_mixed: bool = False  #: Two senders use the system id of the autopilot.
     has_lanes: bool = True  #: `EKF_LANES` is reported.
     #: Whether the autopilot sets INS_USE of each IMU. None: unknown.
     obeys: tuple[bool | None, ...] = ()
@@ -70,6 +71,7 @@ def doubt(view: View, facts: Facts) -> str:
         (facts.other is not None, f"failover_file is of system {facts.other}"),
         (not view.linked, "no ArduPilot that sends each IMU"),
         (not view.monitored, "monitor silent or not alone"),
+        (facts.is_mixed, "two senders with one system id"),
         (not abs(facts.age) <= LARGEST_AGE, MONITOR_LATE),
         (facts.lost > LARGEST_LOSS, "link loses messages"),
         (facts.is_slow, "IMUs come too slowly"),

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 
 from fdi_ros.mavlink.link import Link
 from fdi_ros.mavlink.protocol import ENOUGH, IMU_MESSAGES, MS, NS, RESOLUTION, numbers
-from fdi_ros.mavlink.vehicle import LOST_AFTER, UnitTrack, Vehicle
+from fdi_ros.mavlink.vehicle import LOST_AFTER, TWO_SENDERS, UnitTrack, Vehicle
 from fdi_ros.monitor.diagnostics import MONITOR_LINE, Level, StatusLine
 
 WARNED_LOSS = 0.05  #: Share of lost messages from which the link is a WARN.
@@ -86,6 +86,11 @@ class Reporter:
         ):
             words.append(
                 f"other autopilots on the link, left aside: {', '.join(map(str, others))}"
+            )
+        if vehicle.senders.are_several(now):
+            words.append(
+                f"{TWO_SENDERS.format(vehicle.system)}. Give each autopilot an id of its"
+                " own, and route one link of each"
             )
         if not vehicle.sync.synchronised:
             words.append(

@@ -41,6 +41,7 @@ from fdi_ros.mavlink.protocol import (
     read,
     understood,
 )
+from fdi_ros.mavlink.senders import Senders
 from fdi_ros.mavlink.signing import NO_TIMES, SigningTimes, Verifier, now_in_steps
 from fdi_ros.system import require
 
@@ -65,6 +66,10 @@ _PEERS = 8  # largest number of addresses with a parser
 _LEFT = 1 << 12
 #: ArduPilot's text where it refuses to set a parameter.
 DENIED = re.compile(r"Param write denied \((\w+)\)")
+TWO_SENDERS = (
+    "two senders as system {} behind one address: two autopilots with one id, or two"
+    " links of one"
+)
 V2 = 0xFD  #: First byte of a message of MAVLink 2.
 LARGEST_FLOAT = 3.4e38  #: Largest float in a message.
 
@@ -217,6 +222,7 @@ class Vehicle:
         self.sync = TimeSync()
         self.clock = BootClock()
         self.streams = Streams()
+        self.senders = Senders()
         self.units: dict[int, UnitTrack] = {}
         self.magnetometers: set[int] = set()  #: Units that sent only a magnetometer.
         self.heard = 0  #: Time of the last message, ns. 0: none.
@@ -258,11 +264,15 @@ class Vehicle:
         elif number == self._mavlink.MAVLINK_MSG_ID_UNKNOWN:
             # Of another dialect: the checksum depends on the unknown layout.
             self.counts["unknown"] += 1
-            is_ours = (system, component) == (self.system, AUTOPILOT_COMPONENT)
+            sender = (system, component, peer)
+            is_ours = sender == (self.system, AUTOPILOT_COMPONENT, self.peer)
+            if is_ours:
+                self._look_for_another(sequence, data, now)
             if is_ours and self._sequence == (sequence - 1) & 255:
                 self._sequence = sequence
         elif self._is_from_autopilot(message, number, system, component, peer, now):
             is_new = self._count_lost(sequence)
+            self._look_for_another(sequence, data, now)
             if number in IMU_MESSAGES:
                 return self._sample(number, data[header : header + data[1]], now)
             self._hear(message, number, is_new, now)
@@ -426,6 +436,11 @@ class Vehicle:
         if is_new or self._late > MOST_LATE:
             self._sequence = sequence
         return is_new
+
+    def _look_for_another(self, sequence: int, data: bytes, now: int) -> None:
+        """Report a second sender with the system id in use."""
+        if self.senders.take(sequence, data, now):
+            self.events.append(f"{TWO_SENDERS.format(self.system)}: samples are mixed")
 
     def _sample(self, number: int, payload: bytes, now: int) -> ImuSample | None:
         message = IMU_MESSAGES[number]

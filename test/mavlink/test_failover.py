@@ -1283,6 +1283,19 @@ def test_it_is_ready_once_every_imu_has_agreed(tmp_path: Path) -> None:
     assert reason(talk.run(7.0)) == "ready"
 
 
+def test_a_second_autopilot_of_the_same_system_is_not_ready(
+    flying: Monitored,
+) -> None:
+    assert reason(flying) == "ready"
+    rates = dict.fromkeys((26, 116, 129), 50.0)
+    other = Autopilot("ardupilot", boot=flying.now - 30 * NS, rates=rates)
+    flying.autopilots = (*flying.autopilots, other)
+    flying.peers = (*flying.peers, flying.peers[0])
+    assert reason(flying.run(6.0)) == "no failover: two senders with one system id"
+    flying.autopilots, flying.peers = flying.autopilots[:1], flying.peers[:1]
+    assert reason(flying.run(30.0)) == "ready"
+
+
 def test_a_late_or_silent_monitor_and_a_poor_link_are_not_ready(
     flying: Monitored,
 ) -> None:

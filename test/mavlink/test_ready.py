@@ -55,6 +55,7 @@ def test_two_that_were_bad_have_no_vote_on_the_third() -> None:
         ({"facts": {"age": -1.5}}, "the monitor is late"),
         ({"facts": {"lost": 0.11}}, "link loses messages"),
         ({"facts": {"trip": None}}, "link is slow"),
+        ({"facts": {"is_mixed": True}}, "two senders with one system id"),
         ({"facts": {"is_slow": True}}, "IMUs come too slowly"),
         ({"facts": {"other": 7}}, "failover_file is of system 7"),
         ({"facts": {"is_file_fine": False}}, "failover_file is not usable"),
