@@ -202,6 +202,48 @@ def test_degrees_are_refused(in_degrees, size, words, tmp_path, fdi, refused):
     assert (code, words in said, made.exists()) == (2, True, False)
 
 
+def gentle(seed, units, bias, turn):
+    """Stamps and values of parallel units at 50 Hz: 6 s of rest, then gentle motion up to ``turn``, rad/s."""
+    random = np.random.default_rng(seed)
+    t = 0.02 * np.arange(1500)
+    phase = random.uniform(0.0, 6.0, (3, 3))
+    swings = np.sin(
+        2.0 * np.pi * np.multiply.outer([0.23, 0.41, 0.77], t)[:, None]
+        + phase[..., None]
+    )
+    rate = turn / 3.0 * (np.clip((t - 6.0) / 2.0, 0.0, 1.0) * swings.sum(axis=0)).T
+    z = [
+        rate + random.normal(0.0, bias, 3) + random.normal(0.0, 0.001, rate.shape)
+        for _ in range(units)
+    ]
+    return START + np.round(1e9 * t).astype(np.int64), z
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("bias", [0.002, 0.01])
+@pytest.mark.parametrize(
+    ("units", "odd", "turn", "words"),
+    [
+        (2, [0, 1], 0.05, "are in deg/s, no gyro at rest has a bias and noise of 0.0"),
+        (2, [1], 0.05, "/imu_1 is in deg/s, it shows 57."),
+        (3, [1], 0.05, "/imu_1 is in deg/s, it shows 57."),
+        (3, [1], 0.0, "/imu_1 is in deg/s, at rest it has 5"),
+        (3, [], 0.05, ""),
+        (3, [], 0.0, ""),
+    ],
+)
+def test_gentle_degrees_are_refused(bias, units, odd, turn, words, seed, tmp_path, fdi):
+    stamp, z = gentle(seed, units, bias, turn)
+    for unit in odd:
+        z[unit] = np.degrees(z[unit])
+    topics = [f"/imu_{k}" for k in range(units)]
+    messages = imu_messages(stamp, np.hstack(z), topics)
+    write_mcap(bag := tmp_path / "bag.mcap", messages)
+    said = fdi("inspect", bag).out.splitlines()[0]
+    assert words in said
+    assert said.startswith("NEEDS rad/s" if words else ("READY", "USABLE"))
+
+
 def test_half_a_second_of_a_long_flight_shows_degrees(tmp_path, fdi):
     t = 0.01 * np.arange(9000)
     turn = np.where((t > 50.0) & (t < 51.0), 0.7, 0.3 * np.sin(t))
