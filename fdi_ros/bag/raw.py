@@ -5,11 +5,14 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -262,6 +265,22 @@ LFS = b"version https://git-lfs."
 MOST_NAMED = 4
 #: key in the custom data of the metadata.yaml of an output bag
 MADE_BY_FDI = "fdi_ros"
+MOST_BESIDE = 4096
+"""Files and folders beside a missing recording that are looked at for a similar name."""
+
+
+def _nearly(path: Path) -> str:
+    """Return a hint if a file or folder beside a missing one has nearly its name."""
+    with suppress(OSError, ValueError), os.scandir(path.parent) as found:
+        beside = [one.name for one in islice(found, MOST_BESIDE)]
+        names = [
+            name
+            for name in beside
+            if name.lower().endswith((*SUFFIXES, *LOG_SUFFIXES)) or "." not in name
+        ]
+        if close := difflib.get_close_matches(path.name[:255], names, 1, 0.75):
+            return f", did you mean {shown(str(path.parent / close[0]))}?"
+    return ""
 
 
 def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
@@ -276,7 +295,7 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
             raise BagError(f"{path} is not a recording: expected {EXPECTED}")
         return (path,)
     if not path.is_dir():
-        raise BagError(f"no recording at {path}")
+        raise BagError(f"no recording at {path}{_nearly(path)}")
     if tables := tables_of(path):
         return tables[:FILES]
     about = _metadata(path, damage)

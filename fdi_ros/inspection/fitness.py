@@ -38,6 +38,10 @@ _OF_A_MONITOR = {
     topic.name.rpartition("/")[2]
     for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
 }
+#: a year, s
+YEAR = 31_557_600.0
+#: clocks this far apart have other origins, s
+YEARS = 3.0 * YEAR
 #: default of imus.timeout and of health.stale_timeout, s
 DEFAULT_TIMEOUT = float(PARAMETERS["imus.timeout"].default)
 #: kinds of input, first those with stamps
@@ -102,17 +106,22 @@ def clocks_apart(reports: Sequence[TopicReport], beyond: float = 1.0) -> str:
             (shown(report.topic.name), report.ahead - first.ahead) for report in reports
         ]
     )
-    words = [
-        f"{name} {figures(abs(v), 6)} s {'ahead' if v > 0 else 'behind'}"
-        for name, v in off
-        if abs(v) > beyond
-    ]
+    words = [f"{name} {_apart_words(v)}" for name, v in off if abs(v) > beyond]
     if first is None or not words:
         return ""
     return (
         f"stamps are of other clocks than those of {shown(first.topic.name)}: {', '.join(words)}; no instants can be"
         " compared: synchronise the clocks (PTP, chrony), or stamp on arrival"
     )
+
+
+def _apart_words(ahead: float) -> str:
+    """Return how far a clock is from another one, s. Years are no error of a clock."""
+    side = "ahead" if ahead > 0.0 else "behind"
+    if abs(ahead) < YEARS:
+        return f"{figures(abs(ahead), 6)} s {side}"
+    why = "the others count" if ahead > 0.0 else "it counts"
+    return f"{abs(ahead) / YEAR:.0f} years {side} ({why} since boot, not since 1970)"
 
 
 def no_common_time(reports: Sequence[TopicReport]) -> str:
@@ -149,8 +158,7 @@ def not_waited_for(reports: Sequence[TopicReport], timeout: float) -> str:
     first = reports[0]
     wait = max(timeout, LEAST_WAIT * max(one.interval for one in reports))
     words = [
-        f"{shown(one.topic.name)} {figures(abs(one.ahead - first.ahead))} s"
-        f" {'ahead' if one.ahead > first.ahead else 'behind'}"
+        f"{shown(one.topic.name)} {_apart_words(one.ahead - first.ahead)}"
         for one in reports
         if abs(one.ahead - first.ahead) > 1.1 * wait
     ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Collection, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
@@ -21,6 +21,7 @@ from fdi_ros.monitor.output import Topic
 from fdi_ros.monitor.soundness import (
     DECLARED,
     Concern,
+    Trouble,
     Word,
     live_word,
     units_in_both_halves,
@@ -220,7 +221,7 @@ def describe(
     rows += [
         (
             f"{INPUT}{line.name}",
-            *_input_message(line, _words_about(line.name, concerns)),
+            *_input_message(line, _words_about_input(line.name, concerns)),
             _input_values(line),
         )
         for line in inputs
@@ -230,6 +231,12 @@ def describe(
         StatusLine(level, prefix + name, message, hardware, values)
         for name, level, message, values in rows
     ]
+
+
+def _words_about_input(name: str, concerns: Sequence[Concern]) -> list[str]:
+    """Return the concerns about a unit without the warnings of its own input."""
+    others = [one for one in concerns if one.trouble is not Trouble.INPUT]
+    return _words_about(name, others)
 
 
 def _words_about(name: str, concerns: Sequence[Concern]) -> list[str]:
@@ -437,10 +444,15 @@ def _reach(status: Status) -> str:
         return "no further fault would be detected"
     if any(channel.state == ChannelState.AMBIGUOUS for channel in status.channels):
         return "no further fault would be isolated until this set is decided"
+    # Without a fault there is nothing that another one would be further to.
+    is_first = not any(
+        one.is_left_out or one.state in DECLARED for one in status.channels
+    )
+    fault = "a fault" if is_first else "a further fault"
     if isolate == alive:
-        return "a further fault would be isolated"
+        return f"{fault} would be isolated"
     seen = (
-        "a further fault would be detected"
+        f"{fault} would be detected"
         if detect == alive
         else f"a fault would be detected on {detect} of {alive}"
     )
@@ -534,6 +546,10 @@ def _format_state(channel: ChannelStatus, status: Status) -> str:
     if channel.state == ChannelState.AMBIGUOUS:
         return f"{_format_set(channel, status)}{lasting}"
     words = channel.reason.value or channel.state.name.lower()
+    if channel.reason == Reason.LATELY and not channel.since:
+        return (
+            "not checked yet; used unchecked" if status.has_rate else "not checked yet"
+        )
     size = f"{_figure(abs(channel.error))} {channel.unit}" if channel.error else ""
     if channel.reason == Reason.DISAGREES and size:
         words = f"{words} by {size}"
@@ -644,6 +660,20 @@ def frame_words(first: str, now: str) -> str:
     return f"frame_id changed from {shown(first)!r} to {shown(now)!r}: another sensor?"
 
 
+def input_warning(line: InputStatus) -> str:
+    """Return what puts the source of an input in doubt while it delivers. Empty: nothing."""
+    troubles = []
+    if line.parted:
+        troubles.append(
+            "the clocks of the two inputs differ, and it is unknown which is right: neither is used"
+        )
+    if line.frame_now != line.frame:
+        troubles.append(frame_words(line.frame, line.frame_now))
+    if line.sources:
+        troubles.append(line.sources)
+    return "; ".join(troubles) if line.live else ""
+
+
 def _input_message(line: InputStatus, more: Sequence[str]) -> tuple[Level, str]:
     troubles = [*more]
     troubles += [
@@ -665,14 +695,8 @@ def _input_message(line: InputStatus, more: Sequence[str]) -> tuple[Level, str]:
         troubles.append(
             f"stamps are {_seconds(abs(line.offset))} {side} the clock{why}"
         )
-    if line.parted:
-        troubles.append(
-            "the clocks of the two inputs differ, and it is unknown which is right: neither is used"
-        )
-    if line.frame_now != line.frame:
-        troubles.append(frame_words(line.frame, line.frame_now))
-    if line.sources:
-        troubles.append(line.sources)
+    if warning := input_warning(replace(line, live=True)):
+        troubles.append(warning)
     if line.silent is None:
         return Level.STALE, "; ".join([f"no message yet on {line.topic}", *troubles])
     if not line.live:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Array, Int
+from fdi_ros.monitor.diagnostics import input_warning
 from fdi_ros.monitor.soundness import (
     LEAST_DELIVERED,
     ChannelHealth,
@@ -48,7 +49,14 @@ USUAL_QUANTILE = 0.9
 MOST_RATES = 600
 """Largest number of rates of a unit, from which its usual rate follows."""
 
-_COUNTED_KINDS = ("samples", "missing", "non-finite", "out of range", "spikes")
+_COUNTED_KINDS = (
+    "samples",
+    "missing",
+    "non-finite",
+    "out of range",
+    "spikes",
+    "stuck",
+)
 
 
 class _Reading(NamedTuple):
@@ -57,7 +65,7 @@ class _Reading(NamedTuple):
     at: float
     """Time, s."""
     counts: NDArray[np.int64]
-    """(5, n) counts of each channel, in the order of ``_COUNTED_KINDS``."""
+    """(6, n) counts of each channel, in the order of ``_COUNTED_KINDS``."""
     checked: Int
     """(n,) values of each channel whose fault the others could have shown."""
     residual: Array
@@ -103,7 +111,7 @@ class RecentHealth:
         """Yield each channel in use that is not declared faulty."""
         first = self._readings[0]
         last = self._readings[-1]
-        samples, missing, non_finite, at_end, spikes = last.counts - first.counts
+        samples, missing, non_finite, at_end, spikes, stuck = last.counts - first.counts
         total = samples + missing
         finite = samples - non_finite
         checked = last.checked - first.checked
@@ -132,6 +140,7 @@ class RecentHealth:
                 # A short time of noise would count as the noise of the whole minute.
                 own_noise_rad_s=None if noisy else noise[i],
                 measured_in=one.unit,
+                repeated=float(stuck[i]) / max(1, int(finite[i])),
                 drift=status.drift_since_rest(one),
                 scale=status.certain_scale_error(one),
             )
@@ -173,6 +182,10 @@ class RecentHealth:
         """Yield the health of each input topic, relative to its usual rate and to the other topics."""
         rate = self._rate(LEAST_READINGS)
         if rate is None or not len(rate):
+            for line in inputs:
+                yield UnitHealth(
+                    name=line.name, topic=line.topic, warning=input_warning(line)
+                )
             return
         usual = np.quantile([*self._rates, rate], USUAL_QUANTILE, axis=0)
         usual = np.maximum(usual, 1e-9)
@@ -190,6 +203,7 @@ class RecentHealth:
                 delivered=float(share),
                 rate_hz=float(normal),
                 slow_rate_hz=float(own),
+                warning=input_warning(line),
             )
 
     def _rate(self, readings: int) -> Array | None:

@@ -34,8 +34,14 @@ LEAST_DELIVERED = 0.9
 """Share of its messages that a healthy unit delivers."""
 LEAST_MISSING_S = 1.0
 """Time without a fused rate that is reported, s. Shorter outages are in the notes."""
+LEAST_OF_CAUSE = 0.4
+"""Repeated values are the cause of unchecked samples from this share of them on."""
+LEAST_SATURATED_S = 1.0
+"""Time at the end of a range from which on it is the cause of unchecked samples, s."""
 LEAST_NOISY_S = 3.0
 """Duration of noise that is reported, s."""
+LASTING_S = 1.5
+"""Noise that ended this short a time ago is taken to last, s."""
 LEAST_RESIDUAL = 1e-9
 """Smallest residual that counts as measured, rad/s, as the smallest ``noise.noise_std``."""
 LEAST_VISIBLE_SHARE = 1e-3
@@ -97,6 +103,8 @@ class ChannelHealth:
     """Move of its bias since it was learned at rest, in `measured_in`. 0: not learned."""
     scale: float = 0.0
     """Certain scale error against the other channels, a share. 0: none is certain."""
+    repeated: float = 0.0
+    """Share of its values that repeated the value before for too long."""
     doubt: str = ""
     """Why it is not used at the end, as it continues the name: ``remained suspected``. Empty: used."""
 
@@ -125,6 +133,8 @@ class UnitHealth:
     """Standard deviation of the delay, s."""
     delay_to: str = ""
     """Unit that the delay refers to, the one in the middle of three or more. Empty: not measured."""
+    warning: str = ""
+    """What its input warns of while it delivers. Empty: nothing, or a recording."""
     copy_of: str = ""
     """Unit of which it repeats the values. Empty: none."""
     origin: str = ""
@@ -152,6 +162,14 @@ class Trouble(Enum):
         "judge only the part in flight (--start, --end), or record again, with rest at the start and"
         " less vibration"
     )
+    UNCHECKED_AT_RAIL = (
+        "choose a larger range for the units at the end of their range: meanwhile, and for some time"
+        " after, the others cannot be checked"
+    )
+    UNCHECKED_REPEATS = (
+        "judge only the part before the values repeat (--end), or check the driver if the vehicle moved"
+        " meanwhile; at rest, coarse values repeat by themselves"
+    )
     LEFT_OUT = "to judge {who} too, mend what is wrong, or choose the units in a config (--config)"
     DELIVERY = "check connection, driver and bus load of {who}"
     STAMPS = (
@@ -161,6 +179,7 @@ class Trouble(Enum):
         "judge the parts before and after apart (--start, --end), and set clocks only before a"
         " recording"
     )
+    INPUT = "check what publishes the messages of {who}"
     COPY = "give {who} a sensor of its own: check wiring and driver"
     DOUBT = "make a longer recording: the suspicion of {who} is still open"
     DRIFT = "let {who} warm up before the flight; replace it if its bias moves again"
@@ -305,7 +324,10 @@ def concerns_of(
         for topic, why in unused
     ]
     return [
-        *_unchecked([one for one in channels if one.checked < LEAST_CHECKED]),
+        *_unchecked(
+            [one for one in channels if one.checked < LEAST_CHECKED],
+            why_unchecked(channels),
+        ),
         *left_out,
         *_unit_concerns(units),
         *_incomplete([one for one in alone if one.delivered < LEAST_DELIVERED]),
@@ -412,7 +434,14 @@ def _unit_concerns(units: Sequence[UnitHealth]) -> list[Concern]:
         for unit in units
         if unit.copy_of
     ]
-    return slow + copies
+    warned = [
+        Concern(
+            Word.LOOK, Trouble.INPUT, (unit.name,), f"has a warning: {unit.warning}"
+        )
+        for unit in units
+        if unit.warning
+    ]
+    return slow + copies + warned
 
 
 def _alike(
@@ -423,13 +452,23 @@ def _alike(
     return [Concern(word, trouble, names, words)] if names else []
 
 
-def _unchecked(some: Sequence[ChannelHealth]) -> list[Concern]:
+def why_unchecked(channels: Sequence[ChannelHealth]) -> Trouble:
+    """Return the kind of trouble that keeps channels from being checked."""
+    most = max((1.0 - one.checked for one in channels), default=0.0)
+    if any(one.repeated >= LEAST_OF_CAUSE * most > 0.0 for one in channels):
+        return Trouble.UNCHECKED_REPEATS
+    if any(one.saturated_s >= LEAST_SATURATED_S for one in channels):
+        return Trouble.UNCHECKED_AT_RAIL
+    return Trouble.UNCHECKED
+
+
+def _unchecked(some: Sequence[ChannelHealth], trouble: Trouble) -> list[Concern]:
     least = min((one.checked for one in some), default=0.0)
     share = percent(least)
     words = f"could be checked in only {share} of the samples"
     if share == percent(0.0):
         words = "could not be checked"
-    return _alike(some, Word.CANNOT_TELL, Trouble.UNCHECKED, words)
+    return _alike(some, Word.CANNOT_TELL, trouble, words)
 
 
 def _incomplete(some: Sequence[ChannelHealth]) -> list[Concern]:
@@ -554,6 +593,8 @@ def _noisy_for_a_time(channels: Sequence[ChannelHealth]) -> list[Concern]:
         when = f"from {began:.1f} s" if began >= 0.0 else f"{-began:.0f} s ago"
         times = figures(max(one.noisy_times for one in same), 2)
         words = f"had noise {times} times as large as usual for {first.noisy_s:.1f} s, {when}"
+        if began < 0.0 and -began - first.noisy_s < LASTING_S:
+            words = f"has noise {times} times as large as usual, for {-began:.0f} s now"
         names = tuple(one.name for one in channels if one in same)
         several = len({one.unit for one in same}) > 1
         joined_by = "or" if several else "and"

@@ -208,9 +208,10 @@ def parse_check(text: str, faults: int, names: Sequence[str] = ()) -> list[Condi
             text = f"{part} {parts[0].lower()}"
             meant = _channels_meant(part, names)
             if not meant:
-                raise ConfigError(
-                    f"--check: {text!r} names no channel, {did_you_mean(part, names)}"
-                )
+                is_force = "accel" in part
+                offered = [one for one in names if (".accel" in one) == is_force]
+                hint = did_you_mean(part, offered or names)
+                raise ConfigError(f"--check: {text!r} names no channel, {hint}")
             found.append(Condition(text, parts.pop(0).lower(), channels=meant))
             continue
         condition = _on_quantity(part)

@@ -369,6 +369,8 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     if size.course == "proportional":
         share = size.share_of_rate or 0.0
         of = true_quantity(unit)
+        if shows_nothing(share):
+            return f"does not follow the {of}, off by {figure} rms"
         if is_factor(share):
             return f"{figures(1.0 + share, 2)} times the {of}, off by {figure} rms"
         return f"{figures(100.0 * share, 2, '+')} % of the {of}, {figure} rms"
@@ -403,6 +405,11 @@ def course_word(size: Size) -> str:
 def is_factor(share: float) -> bool:
     """Whether a scale error is so large that words give the factor, not the percentage."""
     return not -1.2 <= share <= 0.9
+
+
+def shows_nothing(share: float) -> bool:
+    """Whether a scale error leaves nothing of the rate, as with swapped axes or without a signal."""
+    return -1.2 <= share <= -0.8
 
 
 def true_quantity(unit: Unit) -> str:

@@ -390,6 +390,7 @@ class Judge(Walk):
                 state=state,
                 since_s=since,
                 reason=reason,
+                repeated=one.counts["stuck"] / max(1, one.finite),
                 drift=status.drift_since_rest(one),
                 scale=status.certain_scale_error(one),
                 noise=one.noise or None,

@@ -12,7 +12,14 @@ import math
 from collections.abc import Collection, Sequence
 
 from fdi_ros.core.states import Reason
-from fdi_ros.monitor.soundness import Concern, Trouble, Word, advice_on, word_of
+from fdi_ros.monitor.soundness import (
+    Concern,
+    Trouble,
+    Word,
+    advice_on,
+    why_unchecked,
+    word_of,
+)
 from fdi_ros.replay.episodes import (
     BRIEF,
     LEAST_BEFORE,
@@ -22,6 +29,7 @@ from fdi_ros.replay.episodes import (
     course_word,
     is_factor,
     is_too_small,
+    shows_nothing,
     true_quantity,
     unit_for,
     warming_words,
@@ -138,7 +146,9 @@ def _to_judge(judgement: Judgement) -> str:
         for one in judgement.monitor.channels
         if one.reason == Reason.FROZEN.value
     ]
-    return Trouble.REPEATS.advice(frozen) if frozen else Trouble.UNCHECKED.value
+    if frozen:
+        return Trouble.REPEATS.advice(frozen)
+    return why_unchecked(judgement.monitor.channels).value
 
 
 def wrongly_named(judgement: Judgement) -> list[str]:
@@ -408,7 +418,10 @@ def _size_words(size: Size, unit: Unit) -> str:
     """Describe an error, as it continues ``It``. Empty: too small to measure."""
     value = _size(size, unit)
     if size.course == "proportional":
-        return f"reads {_share_words(size.share_of_rate or 0.0, unit)}"
+        share = size.share_of_rate or 0.0
+        if shows_nothing(share):
+            return f"does not follow the true {true_quantity(unit)}"
+        return f"reads {_share_words(share, unit)}"
     if size.course == "noisy":
         return f"has noise of {value} {unit.name}"
     if size.course == "varying":

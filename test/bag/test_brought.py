@@ -308,7 +308,13 @@ def test_a_steady_turn_with_vibration_is_no_bias_in_degrees(tmp_path, fdi):
 
 @pytest.mark.parametrize(
     ("offset", "words"),
-    [(37, "37 s ahead"), (-START // 10**9 + 12, f"{START // 10**9 - 12} s behind")],
+    [
+        (37, "37 s ahead"),
+        (
+            -START // 10**9 + 12,
+            "54 years behind (it counts since boot, not since 1970)",
+        ),
+    ],
 )
 def test_stamps_of_other_clocks_are_said_by_replay_itself(
     offset, words, tmp_path, refused
@@ -414,6 +420,28 @@ def test_the_status_of_an_older_px4_without_means_is_said(tmp_path, refused):
     assert "imu_0 up to 40 degC" in said
     assert "imu_1 up to 41 degC, 3 errors" in said
     assert "median of" not in said
+
+
+def test_a_mistyped_path_gets_the_file_that_was_meant(tmp_path, refused):
+    time, rates = drive()
+    meant = write_csv(tmp_path / "hover_flight.csv", time, rates)
+    assert (
+        refused("replay", tmp_path / "hover_fligth.csv")
+        .strip()
+        .endswith(
+            f"no recording at {tmp_path / 'hover_fligth.csv'}, did you mean {meant}?"
+        )
+    )
+    assert "did you mean" not in refused("replay", tmp_path / "other.mcap")
+    assert "did you mean" not in refused("replay", tmp_path / "no" / "hover.csv")
+
+
+def test_gyros_alone_are_offered_for_a_gyro(tmp_path, refused):
+    time, rates = drive()
+    path = write_csv(tmp_path / "a.csv", time, rates)
+    said = refused("replay", path, "--check", "imu_1.q faulty")
+    assert "Expected one of: imu_0.x" in said
+    assert "accel" not in said
 
 
 def test_a_telemetry_log_without_heartbeat_is_read(tmp_path):

@@ -118,6 +118,51 @@ def test_a_slow_unit_is_named_with_both_rates_however_long_it_lasts():
     assert str(one) == "imu_1 delivered 33 % of its messages (33 instead of 100 Hz)"
 
 
+@pytest.mark.parametrize("readings", [1, 20])
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (
+            {"frame": "imu_2", "frame_now": "other_link"},
+            "has a warning: frame_id changed from 'imu_2' to 'other_link': another sensor?",
+        ),
+        (
+            {"sources": "2 publishers on /imu_2, expected one: /a, /b"},
+            "has a warning: 2 publishers on /imu_2, expected one: /a, /b",
+        ),
+        ({"frame": "imu_2", "frame_now": "imu_2"}, ""),
+    ],
+)
+def test_the_monitor_says_what_an_input_warns_of(given, words, readings):
+    """Words and verdict of the monitor are those of its inputs too; the input says it once."""
+    pipeline, health = Pipeline(parallel(3)), RecentHealth()
+    pipeline.process(healthy(3))
+    status = pipeline.status()
+    for k in range(readings):
+        inputs = [
+            InputStatus(f"imu_{u}", f"/imu_{u}", 100 * k + 100, RATE, 0.01, True)
+            for u in (1, 2, 3)
+        ]
+        inputs[1] = replace(inputs[1], **given)
+        health.add(status, inputs, float(k))
+    described = describe(status, "", inputs=inputs, concerns=health.concerns)
+    lines = {line.name: line for line in described}
+    whole, second = lines["monitor"], lines["input imu_2"]
+    assert whole.level == second.level == (Level.WARN if words else Level.OK)
+    assert whole.value("verdict") == ("LOOK" if words else "HEALTHY")
+    assert words in whole.message
+    assert second.message == (words.removeprefix("has a warning: ") or "delivers")
+    assert whole.message.startswith(f"{6 if words else 9} of 9 channels healthy")
+
+
+def test_at_the_start_a_channel_is_not_checked_yet():
+    pipeline = Pipeline(parallel(3, detector__name="sequential"))
+    pipeline.process(healthy(3)[:3])
+    lines = describe(pipeline.status(), "")
+    (words,) = {line.message for line in lines if line.name.startswith("imu_")}
+    assert words in ("not checked yet", "not checked yet; used unchecked")
+
+
 def test_a_declared_fault_is_faulty_and_what_is_unchecked_cannot_be_told():
     faults = ["channel=imu_2.y kind=bias size=0.3 start=3"]
     names = Pipeline(parallel(3)).channel_names

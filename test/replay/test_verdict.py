@@ -49,6 +49,37 @@ needs_sitl = pytest.mark.skipif(
 )
 
 
+def test_the_advice_on_unchecked_channels_is_about_the_cause():
+    def advice(**first):
+        channels = [
+            ChannelHealth(name="a.x", unit="a", **first),
+            ChannelHealth(name="b.x", unit="b", checked=0.3),
+        ]
+        (one, *_) = concerns_of(channels)
+        assert one.who[-1] == "b.x"
+        return one.advice
+
+    assert advice(saturated_s=5.2).startswith("choose a larger range")
+    assert "before the values repeat" in advice(checked=0.2, repeated=0.6)
+    assert "less vibration" in advice(checked=0.2, repeated=0.02, saturated_s=0.2)
+
+
+@pytest.mark.parametrize(
+    ("began", "lasted", "words"),
+    [
+        (-19.0, 18.8, "has noise 10 times as large as usual, for 19 s now"),
+        (-40.0, 18.8, "had noise 10 times as large as usual for 18.8 s, 40 s ago"),
+        (7.0, 18.8, "had noise 10 times as large as usual for 18.8 s, from 7.0 s"),
+    ],
+)
+def test_noise_that_lasts_is_not_some_time_ago(began, lasted, words):
+    noisy = ChannelHealth(
+        name="a.x", unit="a", noisy_s=lasted, noisy_from_s=began, noisy_times=10.0
+    )
+    (one,) = concerns_of([noisy, ChannelHealth(name="b.x", unit="b")])
+    assert one.words == words
+
+
 @needs_cases
 def test_a_unit_that_slows_to_a_third_is_checked_no_better_than_the_others():
     """The unchecked start is a larger part of its values."""
@@ -226,7 +257,7 @@ def test_the_faulty_unit_is_named_after_its_topic(topics, faulty, fdi, tmp_path)
             "Reason: stuck: repeats one value while the others move.",
         ),
         ("kind=dropout start=12 stop=13", "Reason: not a finite number."),
-        ("kind=scale size=-1 start=12", "It reads 100 % too little."),
+        ("kind=scale size=-1 start=12", "It does not follow the true rate."),
         ("kind=scale size=0.2 start=12", "It reads 20 % too much."),
         ("kind=scale size=7 start=12", "It reads 8 times the true rate."),
         ("kind=sign start=12", "It reads -1 times the true rate."),
