@@ -162,10 +162,6 @@ class Trouble(Enum):
         "judge only the part in flight (--start, --end), or record again, with rest at the start and"
         " less vibration"
     )
-    UNCHECKED_AT_RAIL = (
-        "choose a larger range for the units at the end of their range: meanwhile, and for some time"
-        " after, the others cannot be checked"
-    )
     UNCHECKED_REPEATS = (
         "judge only the part before the values repeat (--end), or check the driver if the vehicle moved"
         " meanwhile; at rest, coarse values repeat by themselves"
@@ -212,6 +208,8 @@ class Concern(NamedTuple):
     """What is wrong, as it continues the names: ``has 24 spikes``."""
     joined_by: str = "and"
     """``or``: about one of the names, and which one is not known."""
+    cause: tuple[str, ...] = ()
+    """Channels that cause it, for the advice. Empty: those of the concern."""
 
     def __str__(self) -> str:
         return f"{listed(short_names(self.who), self.joined_by)} {self.words}"
@@ -225,7 +223,7 @@ class Concern(NamedTuple):
     @property
     def advice(self) -> str:
         """What to do about it."""
-        return self.trouble.advice(self.who)
+        return self.trouble.advice(self.cause or self.who)
 
 
 def checked_share(checked: int, finite: int) -> float:
@@ -241,7 +239,7 @@ def advice_on(concerns: Iterable[Concern]) -> str:
     """Return what to do about some concerns, each kind of trouble once."""
     by_trouble: dict[Trouble, list[str]] = {}
     for one in concerns:
-        by_trouble.setdefault(one.trouble, []).extend(one.who)
+        by_trouble.setdefault(one.trouble, []).extend(one.cause or one.who)
     return "; ".join(trouble.advice(who) for trouble, who in by_trouble.items())
 
 
@@ -324,10 +322,7 @@ def concerns_of(
         for topic, why in unused
     ]
     return [
-        *_unchecked(
-            [one for one in channels if one.checked < LEAST_CHECKED],
-            why_unchecked(channels),
-        ),
+        *_unchecked(channels),
         *left_out,
         *_unit_concerns(units),
         *_incomplete([one for one in alone if one.delivered < LEAST_DELIVERED]),
@@ -452,23 +447,30 @@ def _alike(
     return [Concern(word, trouble, names, words)] if names else []
 
 
-def why_unchecked(channels: Sequence[ChannelHealth]) -> Trouble:
-    """Return the kind of trouble that keeps channels from being checked."""
+def why_unchecked(
+    channels: Sequence[ChannelHealth],
+) -> tuple[Trouble, tuple[str, ...]]:
+    """Return what keeps channels from being checked, and the channels that cause it, if known."""
     most = max((1.0 - one.checked for one in channels), default=0.0)
     if any(one.repeated >= LEAST_OF_CAUSE * most > 0.0 for one in channels):
-        return Trouble.UNCHECKED_REPEATS
-    if any(one.saturated_s >= LEAST_SATURATED_S for one in channels):
-        return Trouble.UNCHECKED_AT_RAIL
-    return Trouble.UNCHECKED
+        return Trouble.UNCHECKED_REPEATS, ()
+    at_end = [one.name for one in channels if one.saturated_s >= LEAST_SATURATED_S]
+    if at_end:
+        return Trouble.END_OF_RANGE, tuple(at_end)
+    return Trouble.UNCHECKED, ()
 
 
-def _unchecked(some: Sequence[ChannelHealth], trouble: Trouble) -> list[Concern]:
-    least = min((one.checked for one in some), default=0.0)
-    share = percent(least)
+def _unchecked(channels: Sequence[ChannelHealth]) -> list[Concern]:
+    some = [one for one in channels if one.checked < LEAST_CHECKED]
+    if not some:
+        return []
+    share = percent(min(one.checked for one in some))
     words = f"could be checked in only {share} of the samples"
     if share == percent(0.0):
         words = "could not be checked"
-    return _alike(some, Word.CANNOT_TELL, trouble, words)
+    trouble, cause = why_unchecked(channels)
+    who = tuple(one.name for one in some)
+    return [Concern(Word.CANNOT_TELL, trouble, who, words, cause=cause)]
 
 
 def _incomplete(some: Sequence[ChannelHealth]) -> list[Concern]:

@@ -148,7 +148,8 @@ def _to_judge(judgement: Judgement) -> str:
     ]
     if frozen:
         return Trouble.REPEATS.advice(frozen)
-    return why_unchecked(judgement.monitor.channels).value
+    trouble, cause = why_unchecked(judgement.monitor.channels)
+    return trouble.advice(cause)
 
 
 def wrongly_named(judgement: Judgement) -> list[str]:
