@@ -190,9 +190,10 @@ class Trouble(Enum):
     )
 
     def advice(self, who: Iterable[str]) -> str:
-        """Return what to do. ``who``: channels, units or topics."""
+        """Return what to do. ``who``: channels, units or topics, none if the advice names none."""
         units = dict.fromkeys(name.rpartition(".")[0] or name for name in who)
-        return self.value.format(who=listed([shown(name, LINE) for name in units]))
+        names = [shown(name, LINE) for name in units]
+        return self.value.format(who=listed(names) if names else "")
 
 
 class Concern(NamedTuple):
