@@ -360,11 +360,23 @@ def _unit_name(channels: Sequence[str]) -> str:
     return short[0] if len(short) == 1 else channels[0].rpartition(".")[0]
 
 
-def one_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
-    """Return words for one channel of a set, such as `the x axis of imu_1 or imu_2`."""
+def one_of_words(
+    geometry: Geometry, channels: Sequence[int], sensor: str = "channel"
+) -> str:
+    """Return words for one channel of a set, such as `the x axis of imu_1 or imu_2`.
+
+    Parameters
+    ----------
+    geometry
+        All channels of the half.
+    channels
+        Numbers of the channels in the set.
+    sensor
+        What one of these channels is, in the singular: `gyro`.
+    """
     names = [geometry.channel_names[i] for i in channels]
     if len(names) == geometry.n:
-        return f"any of the {geometry.n} channels"
+        return f"any of the {geometry.n} {sensor}s"
     units = whole_units(geometry, channels)
     if units:
         return f"any axis of {listed(units, 'or')}"
@@ -378,9 +390,9 @@ def one_of_words(geometry: Geometry, channels: Sequence[int]) -> str:
     ]
     if len(names) > _FEW_NAMES:
         return (
-            f"any channel but {listed(others, 'or')}"
+            f"one of the {sensor}s (all but {listed(others)})"
             if len(others) <= _FEW_NAMES
-            else f"any of {len(names)} channels"
+            else f"any of {len(names)} {sensor}s"
         )
     return listed(names, "or")
 

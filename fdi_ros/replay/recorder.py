@@ -347,9 +347,12 @@ class Recorder:
         one.members = members
         one.since = at
         channels = sorted(members)
-        say = one_of_words if one.kind == S.AMBIGUOUS else all_of_words
         names = tuple(self._geometry.channel_names[i] for i in channels)
-        step = Step(round(at, 9), one.kind.name, names, say(self._geometry, channels))
+        if one.kind == S.AMBIGUOUS:
+            who = one_of_words(self._geometry, channels, self._quantity.name)
+        else:
+            who = all_of_words(self._geometry, channels)
+        step = Step(round(at, 9), one.kind.name, names, who)
         if one.steps and (
             one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_STEPS
         ):

@@ -228,7 +228,7 @@ def _faulty_sentences(
     sentences += heat[:MOST_CONCERNS]
     others = dict.fromkeys(one.who for one in lasting[1:] if one.who != first.who)
     if others:
-        sentences.append(f"Also {first_of(list(others), MOST_TOLD)}.")
+        sentences.append(f"Also {_other_names(list(others))}.")
     sentences += [one.sentence for one in set_clocks(judgement)]
     noise = [f"{one}." for one in noise_behind(judgement)[:MOST_CONCERNS]]
     if not noise and first.noisy_from_s is not None:
@@ -238,6 +238,14 @@ def _faulty_sentences(
     if frozen and judgement.monitor.note:
         sentences.append(f"At the end, {judgement.monitor.note}.")
     return " ".join([*sentences, _advice(judgement, lasting)])
+
+
+def _other_names(others: Sequence[str]) -> str:
+    """Join names of channels and sets. Names of sets have commas of their own."""
+    if len(others) == 2:
+        return listed(others)
+    has_commas = any("," in one for one in others)
+    return first_of(others, MOST_TOLD, "; " if has_commas else ", ")
 
 
 def _without_brief_sets(faulty: Sequence[Episode]) -> Sequence[Episode]:

@@ -216,7 +216,7 @@ def test_a_pair_that_measures_one_axis_is_named_by_it_with_how_far_it_is_apart()
         (
             range(6),
             "x, y, z of the body",
-            f"any of the 6 channels AMBIGUOUS from 1.562 s, seen on {axis}: {apart}",
+            f"any of the 6 gyros AMBIGUOUS from 1.562 s, seen on {axis}: {apart}",
         ),
     ):
         states = course(6, 1000, (100, dict.fromkeys(channels, S.AMBIGUOUS)))
@@ -232,6 +232,16 @@ def test_a_pair_that_measures_one_axis_is_named_by_it_with_how_far_it_is_apart()
     assert one_of_words(forces, [3, 4, 5]) == "any axis of imu_2.accel"
     assert all_of_words(forces, [0, 1, 2]) == "imu_1.accel"
     assert one_of_words(turned, [0, 1]) == "imu_1.x or imu_1.y"
+
+
+def test_a_set_of_most_channels_says_which_sensors_it_is_about():
+    three = Geometry.from_triads([np.eye(3)] * 3)
+    most = [0, 1, 2, 3, 5, 6, 8]
+    but = "(all but imu_2.y and imu_3.y)"
+    assert one_of_words(three, most, "gyro") == f"one of the gyros {but}"
+    words = one_of_words(three, [0, 1, 2, 3, 4], "accelerometer")
+    assert words == "any of 5 accelerometers"
+    assert one_of_words(three, range(9), "gyro") == "any of the 9 gyros"
 
 
 def test_what_hides_for_a_while_is_no_new_declaration_and_a_hole_is_no_silence():

@@ -32,7 +32,7 @@ from fdi_ros.monitor.soundness import (
 )
 from fdi_ros.replay.health import MOST_WINDOWS, Deliveries
 from fdi_ros.replay.run import replay
-from fdi_ros.replay.verdict import _without_brief_sets
+from fdi_ros.replay.verdict import _other_names, _without_brief_sets
 from fdi_ros.replay.words import sentences
 
 CASES = ROOT.parent / "shared" / "data" / "cases"
@@ -391,6 +391,15 @@ def test_the_verdict_names_what_is_wrong_and_not_what_was_doubted(
 ):
     out = fdi("replay", three_units(tmp_path / "three.csv", strike)).out
     assert re.match(sentence, out.splitlines()[0]), out
+
+
+def test_other_faults_are_told_apart_though_their_words_have_commas():
+    gyros = "one of the gyros (all but imu_1.x, imu_2.y and imu_3.y)"
+    axis = "the z axis of imu_1, imu_2 or imu_3"
+    assert _other_names(["imu_1.x"]) == "imu_1.x"
+    assert _other_names([gyros, axis]) == f"{gyros} and {axis}"
+    assert _other_names(["imu_1.x", axis, "imu_4"]) == f"imu_1.x; {axis}; imu_4"
+    assert _other_names(["imu_1.x", "imu_2.x", "imu_4"]) == "imu_1.x, imu_2.x, imu_4"
 
 
 def test_a_brief_set_asks_for_nothing_beside_a_fault_that_lasts():
