@@ -1361,6 +1361,14 @@ def test_what_cannot_be_seen_is_not_ready(flying: Monitored, tmp_path: Path) -> 
     assert reason(two.run(15.0)) == "no failover: use of IMU 3 is not reported"
 
 
+def test_use_that_was_not_reported_for_ten_seconds_is_unknown(
+    flying: Monitored,
+) -> None:
+    del flying.autopilots[0].parameters["INS_USE2"]
+    assert reason(flying.run(9.0)) == "ready"
+    assert reason(flying.run(2.0)) == "no failover: use of IMU 2 is not reported"
+
+
 def test_an_imu_that_sends_nothing_is_not_called_slow(flying: Monitored) -> None:
     autopilot = flying.autopilots[0]
     autopilot.refuses.add(116)

@@ -6,8 +6,11 @@
 import numpy as np
 import pytest
 
+from fdi_ros.compiling.compiled import allocate
 from fdi_ros.config.config import Config
 from fdi_ros.core.states import ChannelState
+from fdi_ros.estimator.estimator import Constants, Estimator
+from fdi_ros.estimator.start_bias import doubt_start
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.diagnostics import describe
 from fdi_ros.monitor.pipeline import Output, Pipeline
@@ -185,3 +188,93 @@ def test_holes_in_the_stream_are_no_start(seed: int) -> None:
     """Biases may have moved in each, which widens their covariance."""
     status, *_ = fly(3, {}, seconds=120.0, hole=50.0, seed=seed)
     assert not far(status)
+
+
+# The sizes themselves, in numbers of their own ----------------------------------------------
+
+
+class States:
+    """States of three orthogonal sensors whose biases have a prior of 1 rad/s."""
+
+    def __init__(self, variance: float = 0.1) -> None:
+        self.params, self.kf = allocate(Constants)[0], allocate(Estimator)[0]
+        self.params["sensors"]["n"] = 3
+        self.params["sensors"]["axes"][:3] = np.eye(3)
+        self.params["turn_on"] = 1.0
+        self.kf["fused"]["gain"][:, :3] = np.eye(3)
+        #: Of the bias as estimated. The prior variance is 1, so it is known to 1 less this.
+        self.kf["states"]["p"][:3, :3] = variance * np.eye(3)
+        self.known = np.sqrt(1.0 - variance)
+
+    def doubt(self, sigmas: float, seconds: float = 5.0) -> "States":
+        """Judge the start where the first bias is at so many standard deviations."""
+        self.kf["states"]["x"][0] = sigmas * self.known
+        self.kf["seconds"] = seconds
+        doubt_start(self.params, self.kf, True)
+        return self
+
+    @property
+    def is_far(self) -> bool:
+        return bool(self.kf["far_bias"][0] != 0.0)
+
+    @property
+    def error(self) -> float:
+        return float(self.kf["bias_error"][0])
+
+
+def test_a_start_bias_is_far_from_four_standard_deviations_on() -> None:
+    assert not States().doubt(3.9).is_far
+    assert States().doubt(4.1).is_far
+
+
+def test_the_covariance_allows_for_a_start_bias_from_three_deviations_on() -> None:
+    assert States().doubt(2.95).error == 0.0
+    assert 0.0 < States().doubt(3.05).error < States().doubt(3.9).error
+    full = States().doubt(4.1)
+    # Without its prior the bias would be its value times the prior over what is known.
+    assert full.error + full.kf["states"]["x"][0] == pytest.approx(
+        full.kf["states"]["x"][0] / full.known**2
+    )
+
+
+def test_a_start_is_judged_for_ten_seconds() -> None:
+    assert States().doubt(5.0, seconds=9.9).is_far
+    assert not States().doubt(5.0, seconds=10.1).is_far
+
+
+def test_a_bias_of_which_less_than_a_twentieth_is_known_is_not_doubted() -> None:
+    assert not States(variance=0.955).doubt(5.0).is_far
+    assert States(variance=0.945).doubt(5.0).is_far
+
+
+@pytest.mark.parametrize(("left", "stays"), [(0.27, True), (0.23, False)])
+def test_a_far_bias_is_forgotten_once_less_than_a_quarter_is_left(
+    left: float, stays: bool
+) -> None:
+    """Of two units the states hold half of it: half of it is no healing."""
+    states = States().doubt(5.0)
+    states.kf["states"]["x"][0] = left * states.kf["far_bias"][0]
+    states.kf["seconds"] = 20.0
+    doubt_start(states.params, states.kf, True)
+    assert states.is_far == stays
+    assert bool(states.error) == stays
+
+
+@pytest.mark.parametrize(
+    ("rate", "known", "doubted"),
+    [
+        (11.9, 1.0, True),
+        (12.1, 1.0, False),  # no biases explain so fast a turn
+        (5.0, 0.26, True),
+        (5.0, 0.24, False),  # a rest has shown the biases
+    ],
+)
+def test_a_steady_rate_is_doubted_if_biases_that_no_rest_has_shown_explain_it(
+    rate: float, known: float, doubted: bool
+) -> None:
+    """Known: variance of the rate by biases, of 1 before any rest."""
+    states = States()
+    states.kf["steady_rate"][0] = rate
+    states.kf["known_variance"][:] = known
+    states.doubt(0.0)
+    assert bool(states.kf["alike_bias"][0]) == doubted
