@@ -23,7 +23,7 @@ from fdi_ros.core.repeated import is_at_rest
 TURN_TIME = 0.05
 """Time constant of the rotation that displaces accelerometers, s: a block and a little more.
 The derivative of single samples is mostly noise."""
-HOLE = 2.0
+SLACK_SAMPLES = 2.0
 """Samples by which the difference of two rates may be longer than its window, because of
 the distance of samples and one lost sample."""
 
@@ -147,7 +147,7 @@ def is_new(gyros: Core) -> bool:
 @compiled
 def spans_no_hole(settings: PathSettings, turning: Turning, stamp: int) -> bool:
     """Whether the angular acceleration is a difference over its window, and not over a hole."""
-    longest = turning.unsmoothed.window + round(HOLE * 1e9 * settings.period)
+    longest = turning.unsmoothed.window + round(SLACK_SAMPLES * 1e9 * settings.period)
     since = stamp - turning.unsmoothed.last_rate.stamp
     return turning.unsmoothed.has_last_rate == 1 and since <= longest
 

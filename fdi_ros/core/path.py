@@ -439,7 +439,7 @@ def begin_bias(core: Core) -> None:
         largest = max(largest, core.health.step[i])
     for i in range(n):
         step = core.health.step[i] if core.health.step[i] > 0.0 else largest
-        std = settings.turn_on if motion or lost >> i & 1 else settings.learned[i]
+        std = settings.turn_on_std if motion or lost >> i & 1 else settings.learned[i]
         if not motion and step > settings.sensors.noise_std[i]:
             # The noise is smaller than the step of the sensor, and the average does
             # not remove the quantisation error: up to half a step at rest.

@@ -630,7 +630,7 @@ class PathSettings:
     risk: Real  # allowed probability of an error above the level, 0: no level
     reach: Real  # standard deviations that correspond to the risk
     prior: Channels  # odds that a channel has an unnoticed fault
-    turn_on: Real  # standard deviation of a bias that was not learned, rad/s
+    turn_on_std: Real  # standard deviation of a bias that was not learned, rad/s
     learned: Channels  # standard deviation of a bias averaged at the start, rad/s
 
 

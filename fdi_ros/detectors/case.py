@@ -79,7 +79,7 @@ from fdi_ros.estimator.snapshots import (
 )
 from fdi_ros.model.samples import Array
 
-STANDS = 0.6
+OPENING_SHARE = 0.6
 """Log odds that open a case, as a share of the logarithm of the run length. The sums need
 the whole logarithm, but here every uncertainty counts in full."""
 LEAST_ODDS = 2.0
@@ -233,7 +233,7 @@ def look_for_case(params: Constants, state: State) -> None:
             best = evidence
             found = True
             case.onset = scale.first[(scale.newest - since + 1 + KEPT) % KEPT]
-    stands = found and open_case(params, state, STANDS * math.log(params.limit))
+    stands = found and open_case(params, state, OPENING_SHARE * math.log(params.limit))
     inference = case.inference
     # A shift of all biases calls every channel healthy.
     healthy = inference.log_odds < 0.0 or inference.shift > 0.0
@@ -267,7 +267,7 @@ def look_for_drift(params: Constants, state: State) -> None:
         seconds = LONGEST_DRIFT / (1 << k)
         if not case.open and kf.seconds > seconds:
             case.onset = kf.samples - int(seconds / params.period)
-            open_case(params, state, STANDS * math.log(params.limit))
+            open_case(params, state, OPENING_SHARE * math.log(params.limit))
 
 
 @compiled
@@ -303,7 +303,7 @@ def look_for_change_in_hole(params: Constants, state: State) -> None:
             )
     if worst >= 2.0 * math.log(params.limit):
         case.onset = kf.hole_sample + 1
-        open_case(params, state, STANDS * math.log(params.limit))
+        open_case(params, state, OPENING_SHARE * math.log(params.limit))
 
 
 @compiled

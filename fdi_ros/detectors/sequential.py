@@ -619,7 +619,7 @@ class Sequential(Detector):
         params["louder"] = louder
         params["rest_std"] = REST_STD
         params["g_sensitivity"] = g_sensitivity_std
-        params["turn_on"] = turn_on_std
+        params["turn_on_std"] = turn_on_std
         params["bias_move"] = bias_move
         params["rectified"] = rectified
         params["largest_move"] = largest_move

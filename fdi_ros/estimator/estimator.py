@@ -122,7 +122,7 @@ class Constants:
     rest_std: Real  # of the rate at rest, rad/s
     # of a bias, standard deviation, (rad/s)/(m/s^2), or 0
     g_sensitivity: Real
-    turn_on: Real  # bias from one start to the next, standard deviation, rad/s, or 0
+    turn_on_std: Real  # bias from one start to the next, rad/s. 0: not known
     bias_move: Real  # of a healthy bias in flight, standard deviation, rad/s
     rectified: Real  # as of `fdi_ros.model.quantity.Quantity`
     largest_move: Real  # of all healthy biases together within half a minute, rad/s

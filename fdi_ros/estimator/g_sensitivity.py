@@ -30,7 +30,7 @@ LEAST_CHANGE = 9.8
 """Smallest change of the specific force that counts, m/s^2. The bias random walk covers
 smaller ones, as in ordinary manoeuvres: below 2 mrad/s at 0.1 deg/s/g."""
 SMOOTHING_TIME = 0.05  # time constant of the specific force, s: vibration is no change
-LASTS = 0.5  # s after which another specific force becomes the reference
+NEW_FORCE_AFTER_S = 0.5  # s after which another specific force becomes the reference
 FADE = 0.92  # factor per block on the variance: it fades within half a second
 NEGLIGIBLE = 1e-10  # variance that fades to zero, (rad/s)^2
 # relative growth of the variance of a sample that counts before the block ends
@@ -97,7 +97,7 @@ def renew_reference(params: Constants, kf: Estimator, may_recall: bool) -> bool:
     if kf.force_variance < NEGLIGIBLE:
         kf.force_variance = 0.0
     change = change_of_force(kf)
-    if change == 0.0 or kf.seconds - kf.near_at < LASTS:
+    if change == 0.0 or kf.seconds - kf.near_at < NEW_FORCE_AFTER_S:
         return False
     for a in range(3):
         kf.reference_force[a] = kf.force[a]

@@ -16,7 +16,7 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.estimator.estimator import Constants, Estimator
 from fdi_ros.estimator.noise import RECENT_BLOCKS
 
-LASTS = 30.0
+VIBRATION_MEMORY_S = 30.0
 """Time constant with which the strongest vibration is forgotten, s: a bias that was learned in a
 vibration moves back after it."""
 OTHER = 4.0
@@ -54,7 +54,7 @@ def follow_vibration(params: Constants, kf: Estimator) -> None:
         )
         present += 3.0 / n * max(own * energy - params.expected[i], 0.0)
         expected += 3.0 / n * params.expected[i]
-    faded = kf.strongest_vibration * math.exp(-kf.span / LASTS)
+    faded = kf.strongest_vibration * math.exp(-kf.span / VIBRATION_MEMORY_S)
     kf.strongest_vibration = max(vibration, faded)
     usual = kf.usual_vibration + expected
     kf.vibration_changes = is_other(present + expected, usual, OTHER_BLOCK)

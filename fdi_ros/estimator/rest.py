@@ -25,7 +25,7 @@ it a turn may look like a bias, and in loud noise any slow motion like rest."""
 # largest scatter of one second of blocks over noise: exceeded once in 1000 (72 degrees
 # of freedom)
 REST_CHI = 1.6
-STANDS = 5.0
+STEADY_FOR_S = 5.0
 """Time after which a rate that does not change is doubted, s: the vehicle turns steadily, or it stands
 still with biases that are beyond what `UNLEARNED` or their priors allow."""
 REST_LAST = 12.0  # largest squared distance of the last block from the mean, to end rest in time
@@ -129,7 +129,7 @@ def is_louder_than_rest(params: Constants, kf: Estimator) -> bool:
 
 @compiled
 def follow_steady_rate(params: Constants, kf: Estimator, newest: int) -> None:
-    """Note a rate that does not change for `STANDS`, until the vehicle is known to rest.
+    """Note a rate that does not change for `STEADY_FOR_S`, until the vehicle is known to rest.
 
     It may be a turn, or what is left of the biases: no comparison tells which.
     """
@@ -140,5 +140,5 @@ def follow_steady_rate(params: Constants, kf: Estimator, newest: int) -> None:
     for a in range(3):
         if kf.rest:
             kf.steady_rate[a] = 0.0
-        elif kf.steady_seconds >= STANDS:
+        elif kf.steady_seconds >= STEADY_FOR_S:
             kf.steady_rate[a] = mean_of_blocks(kf.rest_rates, a)

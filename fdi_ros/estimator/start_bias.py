@@ -24,7 +24,7 @@ DOUBTED = 3.0
 """The same from which the covariance allows for it, in full from `FAR` on."""
 START_FOR = 10.0
 """Time in which the start is judged, s. Later, vibration, holes and warming move healthy biases."""
-HEALED = 0.25
+HEALED_SHARE = 0.25
 """Share of a far bias below which the states have left it: of two units they hold half of it."""
 FARTHEST = 12.0
 """Multiple of ``turn_on_std`` from which a steady rate is a turn, whatever the biases."""
@@ -41,7 +41,7 @@ def doubt_start(params: Constants, kf: Estimator, is_start: bool) -> None:
     Written to ``kf.far_bias``, rad/s, zero where a bias is plausible, and to ``kf.bias_error``. What
     is found stays until the bias heals. ``is_start``: the states began with their priors.
     """
-    if params.turn_on == 0.0:
+    if params.turn_on_std == 0.0:
         return
     doubt_steady_rate(params, kf)
     if not is_start or kf.seconds > START_FOR:
@@ -49,7 +49,7 @@ def doubt_start(params: Constants, kf: Estimator, is_start: bool) -> None:
         return
     n = params.sensors.n
     states = kf.states
-    prior = params.turn_on**2
+    prior = params.turn_on_std**2
     worst = -1
     largest = DOUBTED * DOUBTED
     for i in range(n):
@@ -73,7 +73,7 @@ def forget_healed(params: Constants, kf: Estimator) -> None:
     """Forget what the start has shown once a bias that was far has gone."""
     healed = False
     for i in range(params.sensors.n):
-        healed = healed or abs(kf.states.x[i]) < HEALED * abs(kf.far_bias[i])
+        healed = healed or abs(kf.states.x[i]) < HEALED_SHARE * abs(kf.far_bias[i])
     if healed:
         for i in range(params.sensors.n):
             kf.far_bias[i] = kf.bias_error[i] = 0.0
@@ -98,7 +98,7 @@ def doubt_steady_rate(params: Constants, kf: Estimator) -> None:
         square += kf.steady_rate[a] ** 2
         if known > UNSHOWN * alike_variance(params, kf, a):
             largest = max(largest, kf.steady_rate[a] ** 2 / known)
-    if square > (FARTHEST * params.turn_on) ** 2:
+    if square > (FARTHEST * params.turn_on_std) ** 2:
         largest = 0.0
     for i in range(params.sensors.n):
         kf.alike_bias[i] = weight_of(largest) * along(
@@ -111,7 +111,7 @@ def alike_variance(params: Constants, kf: Estimator, a: int) -> float:
     """Return the variance of the rate by the biases before any rest, (rad/s)^2."""
     variance = 0.0
     for i in range(params.sensors.n):
-        variance += (kf.fused.gain[a, i] * params.turn_on) ** 2
+        variance += (kf.fused.gain[a, i] * params.turn_on_std) ** 2
     return variance
 
 
@@ -119,7 +119,7 @@ def alike_variance(params: Constants, kf: Estimator, a: int) -> float:
 def far_bias(params: Constants, kf: Estimator, i: int, worst: int) -> float:
     """Return bias i if it had no prior, rad/s, or 0 if it is plausible beside the worst one."""
     states = kf.states
-    prior = params.turn_on**2
+    prior = params.turn_on_std**2
     known = prior - states.p[i, i]
     if known <= LEAST_SHOWN * prior:
         return 0.0

@@ -7,10 +7,10 @@ The monitor removes learned errors from the samples and remembers declarations. 
 comparison does neither and shows the present difference of the autopilot's own gyros.
 
 Two of three IMUs can be wrong alike: both stand still, or both are remembered as faulty. So
-they outvote the third on an axis only if both have moved of late (`MOVES`), if each is trusted
-(`TRUSTED`) or has moved since it was found bad on another axis, and if
-the monitor has no doubt about them that it does not have about the third as well. Two that
-were both taken out in this flight outvote one that was not only once one of them is back, and has
+they outvote the third on an axis only if both have moved of late (`MOVED_BY_RAD_S`), if each
+is trusted (`TRUSTED`) or has moved since it was found bad on another axis, and if the monitor
+has no doubt about them that it does not have about the third as well. Two that were both taken
+out in this flight outvote one that was not only once one of them is back, and has
 agreed in turns about all axes.
 """
 
@@ -35,11 +35,13 @@ from fdi_ros.mavlink.failover_raw import (
 from fdi_ros.mavlink.protocol import MS, NS, Vector
 
 #: Time constant with which the recent largest size decays, s. Once the IMU has agreed
-#: for `HEALED`, only the present size counts.
+#: for `SIZE_FORGOTTEN_NS`, only the present size counts.
 DECAY = 0.5
 REFUTING = 300 * MS  #: Agreement refutes a doubt that has stood for this time, ns.
 BREAK = 100 * MS  #: A shorter break ends no agreement, and no difference, ns.
-HEALED = NS // 2  #: Time of agreement after which an earlier size is forgotten, ns.
+SIZE_FORGOTTEN_NS = (
+    NS // 2
+)  #: Time of agreement after which an earlier size is forgotten, ns.
 #: A set must stand for this time to name an IMU, ns, and a name is for a difference that
 #: began at most this time after it.
 SET_STANDS = 300 * MS
@@ -70,7 +72,7 @@ SAME_TURN = 0.8
 TINY = 1e-3  #: Resolution of the messages, rad/s.
 #: An axis moves if its mean rate and the one of another IMU change alike, by this or more, rad/s. A
 #: steady rate is no motion: both axes may be stuck at it.
-MOVES = 0.005
+MOVED_BY_RAD_S = 0.005
 #: The change must also exceed this multiple of the noise in the mean. At 3, two axes that died 10 s
 #: apart in noise of 6 mrad/s outvote the third IMU in 2 of 12 flights, at 4 in none.
 MOVES_SIGMAS = 4.0
@@ -217,7 +219,7 @@ def _worst(sizes: Vector, blamed: set[int]) -> str:
 
 def _note_sizes(track: Track, agreed: int | None, share: float, now: int) -> None:
     """Note the sizes of late. share: what is left of the last ones."""
-    is_healed = agreed is not None and now - agreed >= HEALED
+    is_healed = agreed is not None and now - agreed >= SIZE_FORGOTTEN_NS
     kept = 0.0 if is_healed else share
     x, y, z = (
         max(new, kept * old)
@@ -378,7 +380,7 @@ class Evidence:
             blamed = self._blamed_axes(k, axes, units)
             if k in out or blamed:
                 self._note_wrong(track, track.partners, axes)
-            elif agreed is not None and now - agreed >= HEALED:
+            elif agreed is not None and now - agreed >= SIZE_FORGOTTEN_NS:
                 track.wrong.clear()
             is_known = track.states or k == odd
             found_now = Imu(
@@ -476,7 +478,7 @@ class Evidence:
         for pair in combinations(turns.keys() & self._turns.keys(), 2):
             noise = self.raw.noise(*pair)
             for axis in range(3):
-                needed = max(MOVES, MOVES_SIGMAS * noise[axis])
+                needed = max(MOVED_BY_RAD_S, MOVES_SIGMAS * noise[axis])
                 one, other = (turns[k][axis] - self._turns[k][axis] for k in pair)
                 least = abs(nearest_zero((one, other)))
                 if least >= needed and abs(one - other) <= least:

@@ -408,7 +408,7 @@ class BootClock:
     BACK, AHEAD = NS, 2 * NS
     #: For this time, ns, all times must be a step: over a second path, copies of messages
     #: may come seconds late, those of all units together, between the present ones.
-    LASTS = 200 * MS
+    STEP_STANDS_NS = 200 * MS
     _OVER = (1 << 32) * MS
 
     def __init__(self) -> None:
@@ -445,7 +445,7 @@ class BootClock:
         self._odd += 1
         if self._odd == 1:
             self._odd_since = now
-        if self._odd >= BELIEVED_AFTER and now - self._odd_since >= self.LASTS:
+        if self._odd >= BELIEVED_AFTER and now - self._odd_since >= self.STEP_STANDS_NS:
             self.restarts += 1
             self.reset()
         return None

@@ -222,7 +222,7 @@ def _fill_settings(
     describe_sensors(settings["sensors"], geometry, noise)
     settings["largest_noise"] = noise.noise_std.max()
     settings["return_limit"] = normal_isf(RETURN_PROBABILITY / 2)
-    settings["turn_on"] = config.bias.turn_on_std
+    settings["turn_on_std"] = config.bias.turn_on_std
     settings["learned"][:n] = noise.bias_std
     settings["max_drift"] = config.bias.max_drift
     settings["risk"] = integrity.risk

@@ -247,9 +247,9 @@ def _check(
     value = errors["value"]
     n = geometry.n
     count = len(value)
-    turn_on = settings.turn_on_std
+    turn_on_std = settings.turn_on_std
     prior = layout["prior"][:count].copy()
-    prior[:n] = turn_on
+    prior[:n] = turn_on_std
     limit = PLAUSIBLE * np.sqrt(prior**2 + np.diag(errors["covariance"]))
     delays = layout["delays"][1 : len(geometry.units)]
     # A state from before the first sample has only biases.
@@ -260,7 +260,7 @@ def _check(
             f"error state {worst + 1} is {value[worst]:.3g}, expected within {limit[worst]:.3g}"
         )
     common = float(np.abs(geometry.least_squares @ (bias + value[:n])).max())
-    most = PLAUSIBLE * turn_on
+    most = PLAUSIBLE * turn_on_std
     if common > most:
         raise RefusalError(
             f"its biases pass for a turn of {common:.3g} rad/s, expected within {most:.3g}"
@@ -281,7 +281,7 @@ def _restore(state: dict[str, Any], pipeline: Pipeline, age: float) -> None:
         bias["channels_known"] = mask_of(map(names.index, state["known"]))
         bias["learning"] = False
         bias["outcome"] = IN_MOTION if state["in_motion"] else RESTORED
-        std = settings["turn_on"] if state["in_motion"] else settings["learned"][:n]
+        std = settings["turn_on_std"] if state["in_motion"] else settings["learned"][:n]
         walk = np.array(pipeline.config.noise.bias_walk)
         core["sample"]["bias_std"][:n] = np.sqrt(std**2 + walk**2 * age)
         core["remaining"][:n] = core["sample"]["bias_std"][:n]

@@ -624,7 +624,7 @@ def _copies(
     )
 
 
-def _format_bias(bias: Any, names: Sequence[str], turn_on: float) -> str:
+def _format_bias(bias: Any, names: Sequence[str], turn_on_std: float) -> str:
     """Say where the biases come from, or why a time was refused as rest."""
     outcome = int(bias["outcome"])
     if outcome in (LEARNED, RESTORED):
@@ -639,7 +639,7 @@ def _format_bias(bias: Any, names: Sequence[str], turn_on: float) -> str:
         FIXED: "fixed" if bias["given"] else "zero",
         LEARNING: "learning",
         IN_MOTION: "not at rest at the start: biases as given, what the channels see of each other is followed; the"
-        f" common bias is unknown to {turn_on:g} rad/s",
+        f" common bias is unknown to {turn_on_std:g} rad/s",
     }
     return known.get(outcome) or f"refused{_format_refusal(bias, names)}"
 

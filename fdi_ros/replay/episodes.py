@@ -24,11 +24,11 @@ from fdi_ros.system.text import figures, listed, percent, plus_minus
 
 STRETCH_GAP = 10.0
 """Gap between two stretches, s. A shorter hole is within a stretch: messages were lost."""
-HOLE = 1.0
+LONGEST_HOLE_S = 1.0
 """Longest time without samples over which faults are injected and curves are drawn, s."""
 
 
-def pieces(stamp: NDArray[np.int64], longest: float = HOLE) -> list[slice]:
+def pieces(stamp: NDArray[np.int64], longest: float = LONGEST_HOLE_S) -> list[slice]:
     """Cut stamps (N,), ns, at intervals longer than ``longest``, s. Return slices of rows."""
     edges = [
         0,

@@ -23,7 +23,7 @@ from fdi_ros.monitor.building import GUARD, build_geometry, build_noise
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import (
-    HOLE,
+    LONGEST_HOLE_S,
     Episode,
     Story,
     detail_words,
@@ -335,7 +335,9 @@ class Report(Sink):
         for curves, half in halves:
             curves.alone.add(time, half)
         # Curves also break at holes within a stretch.
-        holes = np.flatnonzero(np.diff(time, prepend=self._last or time[0]) > HOLE)
+        holes = np.flatnonzero(
+            np.diff(time, prepend=self._last or time[0]) > LONGEST_HOLE_S
+        )
         for k, part in enumerate(np.split(np.arange(len(time)), holes)):
             if k:
                 self.begin_stretch()

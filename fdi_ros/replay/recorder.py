@@ -36,7 +36,7 @@ from fdi_ros.model.quantity import RATE, Quantity
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.output import Output
 from fdi_ros.replay.episodes import (
-    HOLE,
+    LONGEST_HOLE_S,
     MOST_STEPS,
     Apart,
     Candidate,
@@ -67,7 +67,7 @@ MOST_EPISODES = 1000
 UNIT_SILENCE = 0.5
 """Channels of a unit that fall silent within this time, s, belong to one episode."""
 SILENCE_AFTER_HOLE = 0.5
-"""Silence shorter than `HOLE` that begins within this time after a hole, s, belongs to the
+"""Silence shorter than `LONGEST_HOLE_S` that begins within this time after a hole, s, belongs to the
 hole."""
 RATE_BEFORE = 0.5
 """The rate before an episode is the one at this time before its start, s."""
@@ -238,7 +238,9 @@ class Recorder:
         part = self._part or Stretch(float(time[0]), float(time[0]), 0, 0, 0.0)
         judged = np.isfinite(output.threshold)
         steps = np.diff(np.concatenate([[part.end_s], time]))
-        watched = judged & (steps <= HOLE) & ~np.isin(before, _DECLARED).any(axis=1)
+        watched = (
+            judged & (steps <= LONGEST_HOLE_S) & ~np.isin(before, _DECLARED).any(axis=1)
+        )
         self._part = Stretch(
             part.start_s,
             float(time[-1]),
@@ -479,7 +481,7 @@ class Recorder:
         """Make an episode from one that ended or is open. None: only a hole."""
         assert self._part is not None
         end = self._part.end_s if at is None else at
-        if one.kind == S.STALE and one.after_hole and end - one.start < HOLE:
+        if one.kind == S.STALE and one.after_hole and end - one.start < LONGEST_HOLE_S:
             return None
         geometry = self._geometry
         names = self._geometry.channel_names

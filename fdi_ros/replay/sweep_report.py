@@ -253,7 +253,7 @@ def write_csv(file: IO[str], results: Iterable[Subject], plan: Plan) -> None:
 # Words and tables
 
 
-MOVES = 0.1
+MOVING_RAD_S = 0.1
 """Largest rate during a fault from which on the vehicle counts as moving, rad/s."""
 
 
@@ -344,9 +344,9 @@ def verdict_lines(tried: Subject, plan: Plan) -> list[str]:
         f" {false} of {len(tried.trials)} faults"
     )
     # At rest smaller faults are found than in flight.
-    moving = sum(speed > MOVES for speed in tried.speeds)
+    moving = sum(speed > MOVING_RAD_S for speed in tried.speeds)
     times = len(tried.times)
-    motion = f"the vehicle turned faster than {MOVES:g} rad/s at {moving} of the {times} start times"
+    motion = f"the vehicle turned faster than {MOVING_RAD_S:g} rad/s at {moving} of the {times} start times"
     rest = ": the vehicle was mostly AT REST; in flight the figures are worse (choose a part with --start, --end)"
     return [*words, motion if 2 * moving >= times else motion + rest]
 

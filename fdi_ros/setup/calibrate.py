@@ -372,9 +372,9 @@ def _sensors(
     units = list(dict.fromkeys(unit for unit in nominal.unit_of if unit)) or [""]
     unit = np.array([units.index(unit) if unit else 0 for unit in nominal.unit_of])
     delay = UNIT_DELAY if source.stamped else CHANNEL_DELAY
-    turn_on = max(config.bias.turn_on_std, 1e-6)
+    turn_on_std = max(config.bias.turn_on_std, 1e-6)
     expected = np.zeros(len(units))
-    return Priors(axes, unit, len(units), scale, turn_on, delay, expected)
+    return Priors(axes, unit, len(units), scale, turn_on_std, delay, expected)
 
 
 class _Watched(Kept):

@@ -740,10 +740,10 @@ def _not_shown(found: SetupResult, unit: Unit) -> Iterator[Finding]:
         words = "the body frame: a recording shows only the axes of an array relative to each other; those of the first"
         words += " three channels are assumed (a cone)"
     yield Finding(Role.UNKNOWN, "body frame", words)
-    turn_on = found.config.bias.turn_on_std
+    turn_on_std = found.config.bias.turn_on_std
     words = "the range of the gyros (health.max_rate: see the data sheet), and how much a bias changes from one start"
-    words += f" to the next (bias.turn_on_std: {turn_on * unit.factor:.3g} {unit.name} is assumed)"
-    yield Finding(Role.UNKNOWN, "range, turn-on bias", words, value=turn_on)
+    words += f" to the next (bias.turn_on_std: {turn_on_std * unit.factor:.3g} {unit.name} is assumed)"
+    yield Finding(Role.UNKNOWN, "range, turn-on bias", words, value=turn_on_std)
     possible = [
         report
         for report in found.reports

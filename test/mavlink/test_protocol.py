@@ -243,7 +243,7 @@ def test_a_clock_that_begins_anew_is_found_and_a_single_wrong_time_is_not() -> N
     steps = [k * 20 * MS for k in range(20)]
     taken = [clock.unwrap(step, now + step, True) for step in steps]
     assert clock.restarts == 1
-    lasting = BootClock.LASTS // (20 * MS) + 1
+    lasting = BootClock.STEP_STANDS_NS // (20 * MS) + 1
     assert taken == [None] * lasting + steps[lasting:]
 
 

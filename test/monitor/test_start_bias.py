@@ -200,7 +200,7 @@ class States:
         self.params, self.kf = allocate(Constants)[0], allocate(Estimator)[0]
         self.params["sensors"]["n"] = 3
         self.params["sensors"]["axes"][:3] = np.eye(3)
-        self.params["turn_on"] = 1.0
+        self.params["turn_on_std"] = 1.0
         self.kf["fused"]["gain"][:, :3] = np.eye(3)
         #: Of the bias as estimated. The prior variance is 1, so it is known to 1 less this.
         self.kf["states"]["p"][:3, :3] = variance * np.eye(3)
