@@ -1,9 +1,13 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers in sentences."""
+"""Numbers in sentences, and words of fields."""
+
+import ast
+from collections.abc import Iterator
 
 import pytest
+from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -41,3 +45,72 @@ def test_a_number_in_a_sentence_has_no_exponent_and_its_digits(value, digits):
 )
 def test_only_none_and_all_are_0_and_100_percent(share, words):
     assert percent(share) == words
+
+
+PACKAGE = ROOT / "fdi_ros"
+#: Their tables state the words of each field in other ways.
+STATED_ELSEWHERE = (PACKAGE / "config", PACKAGE / "fleet" / "tables.py")
+
+
+def public_results(tree: ast.Module) -> Iterator[ast.ClassDef]:
+    """Yield the public dataclasses and NamedTuples of a module."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            words = map(ast.unparse, [*node.decorator_list, *node.bases])
+            if any("dataclass" in one or one == "NamedTuple" for one in words):
+                yield node
+
+
+def is_text(node: ast.stmt) -> bool:
+    """Return whether a statement is a string alone, as the docstring of a field is."""
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
+def undocumented(source: str) -> list[str]:
+    """Return the fields without words that help() in editors and Sphinx show.
+
+    These are `#:` in the lines of the field or directly above, or a string below. The
+    description of a `setting` is in the tables of the parameters.
+    """
+    lines = source.splitlines()
+    missing = []
+    for kind in public_results(ast.parse(source)):
+        for field, after in zip(kind.body, [*kind.body[1:], ast.Pass()], strict=True):
+            if not isinstance(field, ast.AnnAssign) or is_text(after):
+                continue
+            name = ast.unparse(field.target)
+            own = "\n".join(lines[field.lineno - 1 : field.end_lineno])
+            above = lines[field.lineno - 2].strip()
+            has_words = "#:" in own or above.startswith("#:") or "setting(" in own
+            if not has_words and not name.startswith("_"):
+                missing.append(f"{kind.name}.{name}")
+    return missing
+
+
+def test_every_field_of_a_public_result_is_documented():
+    missing = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if not any(path.is_relative_to(one) for one in STATED_ELSEWHERE)
+        for name in undocumented(path.read_text(encoding="utf-8"))
+    ]
+    assert not missing
+
+
+def test_a_plain_comment_documents_no_field():
+    source = """
+class Result(NamedTuple):
+    a: int  #: a number
+    b: int  # a number
+    #: a number
+    c: int
+    d: int
+    '''A number.'''
+    # a number
+    e: int
+"""
+    assert undocumented(source) == ["Result.b", "Result.e"]

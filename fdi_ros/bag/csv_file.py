@@ -298,6 +298,7 @@ class _Choice(NamedTuple):
 
     #: entries of ``columns.yaml``, empty without the file
     given: dict[str, Any]
+    #: name of the column of times
     time: str
     #: rates about x, y and z of each IMU
     imus: list[list[str]]
@@ -455,6 +456,7 @@ class _Place(NamedTuple):
     head: str
     #: number behind the axis, may be empty
     number: str
+    #: x, y or z
     axis: str
 
 

@@ -88,7 +88,9 @@ _MOST_TEXTS = 1000
 class Source(NamedTuple):
     """Where samples come from: one instance of one kind of logged message."""
 
+    #: name of the message, such as GYR or ``sensor_gyro``
     kind: str
+    #: number of the sensor among those of the kind, from 0
     instance: int
 
 
@@ -132,6 +134,7 @@ class Track:
     slowest: float
     #: samples by which its rate can be judged
     fewest: int = _FEWEST
+    #: number of samples so far
     count: int = 0
     #: samples that follow the one before without a gap
     fast: int = 0

@@ -203,12 +203,15 @@ class Piece(NamedTuple):
     start_time: int
     #: ns
     end_time: int
+    #: begin in the file, bytes
     offset: int
     #: bytes in the file
     size: int
     #: bytes when decompressed
     raw_size: int
+    #: checksum of the decompressed bytes, 0 if none is given
     crc: int = 0
+    #: name of the method, empty if not compressed
     compression: str = ""
     #: whether the file ends inside
     cut: bool = False

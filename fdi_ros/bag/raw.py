@@ -40,8 +40,11 @@ NO_HORIZON = 2**63 - 1
 class Topic:
     """One topic of a recording."""
 
+    #: full name, such as ``/imu_1/data_raw``
     name: str
+    #: of the messages, such as ``sensor_msgs/msg/Imu``
     type: str
+    #: of the messages, such as ``cdr`` or ``ros1``
     encoding: str = "cdr"
     #: number of messages
     count: int = 0
@@ -133,7 +136,9 @@ class Damage:
 
     #: what readers must know, and is no damage
     facts: list[str] = field(default_factory=list)
+    #: one sentence for each place, at most `MOST`
     lines: list[str] = field(default_factory=list)
+    #: number of further places
     more: int = 0
 
     #: gyros that cannot be read as such, and why
@@ -177,6 +182,7 @@ class LogText(NamedTuple):
     stamp: int
     #: logged message (MSG, ERR) or severity
     kind: str
+    #: as the autopilot wrote it
     text: str
 
 

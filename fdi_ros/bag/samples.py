@@ -44,9 +44,11 @@ Tap = Callable[[Batch, Int], None]
 class Newest(NamedTuple):
     """How far a topic has come."""
 
+    #: number of messages so far
     received: int = 0
     #: time of recording of the last message, ns, 0 before the first
     log_time: int = 0
+    #: stamp of the last message, ns, 0 before the first
     stamp: int = 0
 
 

@@ -54,6 +54,7 @@ from fdi_ros.model.samples import Array, Bytes, Int
 class Brought(NamedTuple):
     """Which channels of a sample the messages of one topic bring."""
 
+    #: places of their values in a sample
     gyros: slice
     accelerometers: slice  #: their values stand behind those of the gyros
 

@@ -42,20 +42,23 @@ GIVEN = math.nan  # in the table: the caller of `prepare_layout` gives the size
 class StateKind(NamedTuple):
     """One kind of error."""
 
+    #: as in reports: ``bias``
     name: str
+    #: of a state. Empty: dimensionless
     unit: str
-    per_unit: (
-        bool  # one for each unit but the first, the reference, or one for each channel
-    )
+    #: one for each unit but the first, the reference. Otherwise one for each channel
+    per_unit: bool
     by: tuple[int, ...]
     """Multiplier of each state; empty: a single state, the rate of change of `feeds`."""
-    # standard deviation before anything is shown, where `prepare_layout` is given no
-    # other
+    #: standard deviation at the start, where `prepare_layout` is given no other
     prior: float
-    walk: float = 0.0  # random walk, per sqrt(s), where none other is given
-    # s, after which a rate of change has faded: a Gauss-Markov process
+    #: random walk, per sqrt(s), where `prepare_layout` is given no other
+    walk: float = 0.0
+    #: time constant with which a rate of change fades (Gauss-Markov process), s. 0: it
+    #: stays
     memory: float = 0.0
-    feeds: str = ""  # name of the kind whose rate of change this is
+    #: name of the kind whose rate of change this is. Empty: of none
+    feeds: str = ""
 
 
 ERROR_KINDS = (

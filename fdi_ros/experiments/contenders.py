@@ -114,10 +114,14 @@ METHODS: dict[str, Any] = {
 class Evaluation(NamedTuple):
     """Verdicts of one method on N samples at its loose threshold."""
 
-    ratio: Array  # (N,) statistic over threshold, NaN without an alarm
-    suspects: Mask  # (N, n)
-    isolated: Mask  # (N,)
-    named: NDArray[np.intp]  # (N,) the worst of the suspects; -1 without suspects
+    #: (N,) statistic over threshold, NaN without an alarm
+    ratio: Array
+    #: (N, n) channels that may be the faulty ones
+    suspects: Mask
+    #: (N,) whether the method isolates its suspects
+    isolated: Mask
+    #: (N,) the worst of the suspects, -1 without suspects
+    named: NDArray[np.intp]
     best: NDArray[np.intp] | None
     """(N,) channel of the largest normalised residual. None if the method has no residuals."""
 
@@ -171,7 +175,9 @@ class Contender:
 class Contenders(NamedTuple):
     """Methods that run on a geometry, and why the others do not."""
 
+    #: methods by name
     running: dict[str, Contender]
+    #: reasons by name of the method
     refused: dict[str, str]
 
 
@@ -188,8 +194,11 @@ def _largest(size: Array) -> NDArray[np.intp]:
 class Cell(NamedTuple):
     """Trials on one geometry, of one size of fault or one selection, or without faults."""
 
+    #: number of the geometry in the section
     geometry: int
+    #: of the fault, in noise_std. 0: no fault, or a selection
     size: float = 0.0
+    #: name of a selection of trials. Empty: none
     selection: str = ""
 
     @property

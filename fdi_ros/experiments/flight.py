@@ -47,8 +47,11 @@ from fdi_ros.replay.outcomes import OutcomeKind, quantiles, rms, score, share, s
 class Motion:
     """Body rate as a smooth function of time: holds and smooth steps between knots."""
 
-    time: Array  # knots, (K,) s, strictly increasing
-    rate: Array  # body rate at the knots, (K, 3) rad/s. It stays what it is before the first and after the last.
+    #: (K,) knots, s, strictly increasing
+    time: Array
+    #: (K, 3) body rate at the knots, rad/s. It is constant before the first and after
+    #: the last
+    rate: Array
 
     def rate_at(self, t: Array) -> Array:
         """Body rate (N, 3) rad/s at times t (N,) s."""
@@ -114,18 +117,24 @@ def _phase(
 class GyroErrors:
     """Errors of gyros of one make. The defaults are typical of a small MEMS unit."""
 
-    noise_std: float = 0.0025  # white noise of one sample, rad/s
-    bias_std: float = 0.01  # bias at switch-on, rad/s
-    # random walk of the bias, rad/s per square root of a second
+    #: white noise of one sample, rad/s
+    noise_std: float = 0.0025
+    #: bias at switch-on, rad/s
+    bias_std: float = 0.01
+    #: random walk of the bias, rad/s per square root of a second
     bias_walk: float = 2e-5
-    scale_std: float = 0.001  # scale factor, dimensionless
-    misalignment_std: float = 0.001  # angle between true and nominal axis, rad, in each of the two directions across it
-    delay_std: float = 0.0002  # sampling instant of a chip against the stamp, s
-    resolution: float = float(
-        np.radians(1 / 16.4)
-    )  # step of the converter, rad/s, 0 for none
-    max_rate: float = 34.9  # range of the converter, rad/s
-    channels_per_chip: int = 3  # channels that are sampled together
+    #: error of the scale factor, dimensionless
+    scale_std: float = 0.001
+    #: angle of the true axis in each of the two directions across the nominal axis, rad
+    misalignment_std: float = 0.001
+    #: sampling instant of a chip against the stamp, s
+    delay_std: float = 0.0002
+    #: step of the converter, rad/s. 0: none
+    resolution: float = float(np.radians(1 / 16.4))
+    #: range of the converter, rad/s
+    max_rate: float = 34.9
+    #: number of channels that are sampled together
+    channels_per_chip: int = 3
 
     def draw(self, geometry: Geometry, rng: np.random.Generator) -> Gyros:
         """Make one unit: draw all that stays as it is from switch-on."""
@@ -148,9 +157,13 @@ class GyroErrors:
 class Gyros:
     """One made unit: its true axes (n, 3), bias (n,) rad/s and sampling delay (n,) s."""
 
+    #: (n, 3) true axes times true scale factors
     axes: Array
+    #: (n,) at switch-on, rad/s
     bias: Array
+    #: (n,) of the sampling instant against the stamp, s
     delay: Array
+    #: from which the unit was drawn
     errors: GyroErrors
 
     def measure(
@@ -194,10 +207,14 @@ DEFAULT_SIZES = {
 class Flown(NamedTuple):
     """One simulated flight."""
 
+    #: samples of all channels
     block: Block
-    truth: Array  # true body rates, (N, 3) rad/s
-    channel: int | None  # the faulty channel, None if all are healthy.
-    onset: int  # row at which the fault begins, or would
+    #: (N, 3) true body rates, rad/s
+    truth: Array
+    #: the faulty channel. None: all are healthy
+    channel: int | None
+    #: row at which the fault begins, or would
+    onset: int
 
 
 class Flight(TrialProtocol[str]):

@@ -128,19 +128,23 @@ NAMED_GEOMETRIES: dict[str, Callable[[], Geometry]] = {
 class Section:
     """One set of trials of a study."""
 
+    #: name of the protocol, such as ``flight``
     kind: str
-    settings: Mapping[
-        str, Any
-    ]  # every setting of the kind with defaults, as plain values for JSON
+    #: every setting of the kind with defaults, as plain values for JSON
+    settings: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Study:
     """A whole study."""
 
+    #: of the study file, without its ending
     name: str
+    #: in words
     title: str
+    #: of all random numbers
     seed: int
+    #: in the order of the study file
     sections: tuple[Section, ...]
 
 
@@ -268,10 +272,15 @@ STUDY_FORMAT = 1  # of the JSON
 class Block(NamedTuple):
     """Some trials of one cell: the unit of work and of seeding."""
 
+    #: number of the section, from 0
     section: int
+    #: `PREPARING` or `TRIALS`
     stage: int
+    #: number of the cell in its stage, from 0
     cell: int
+    #: number of the block in its cell, from 0
     block: int
+    #: number of trials
     trials: int
 
 
@@ -279,20 +288,29 @@ class Block(NamedTuple):
 class SectionResult(Section):
     """Figures of one section."""
 
-    found: Preparation  # what the first stage gave
+    #: results of the first stage
+    found: Preparation
+    #: methods that did not run, with the reasons
     not_run: Refusals
-    cells: list[Figures]  # of each cell of the second stage
+    #: figures of each cell of the second stage
+    cells: list[Figures]
 
 
 @dataclass(frozen=True)
 class StudyResult:
     """All figures and settings of a study."""
 
+    #: `STUDY_FORMAT`
     format: int
-    fdi_ros: str  # version of the package
+    #: version of the package
+    fdi_ros: str
+    #: name of the study
     study: str
+    #: in words
     title: str
+    #: of all random numbers
     seed: int
+    #: in the order of the study file
     sections: list[SectionResult]
 
 

@@ -31,9 +31,12 @@ Curve = tuple[
 class Group(NamedTuple):
     """Cells of a section that are on one geometry."""
 
-    mounting: str  # name of the geometry
+    #: name of the geometry
+    mounting: str
+    #: figures of each cell
     cells: Sequence[Figures]
-    settings: Mapping[str, Any]  # of the section
+    #: of the section
+    settings: Mapping[str, Any]
 
     @property
     def faults(self) -> list[Figures]:

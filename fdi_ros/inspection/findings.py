@@ -32,6 +32,7 @@ class Role(str, Enum):
 class Finding(NamedTuple):
     """One thing that was found."""
 
+    #: what the finding is for in a report
     role: Role
     #: the quantity or the trouble, in a word or two
     what: str

@@ -54,10 +54,13 @@ BELIEVED = 1e6
 class TopicReport:
     """Observations on one topic."""
 
+    #: name, type and number of messages
     topic: Topic
     #: reader of gyros for its type, or None
     kind: type[Source] | None
+    #: number of messages read
     received: int = 0
+    #: number of messages that could not be decoded
     malformed: int = 0
     #: time of recording of the first message, ns
     first: int = 0
@@ -65,6 +68,7 @@ class TopicReport:
     last: int = 0
     #: usual interval, s, 0 while unknown
     interval: float = 0.0
+    #: number of intervals that are too long
     gaps: int = 0
     #: longest interval, s
     longest: float = 0.0

@@ -70,8 +70,11 @@ def _first_text(path: Path, topic: str) -> bytes | None:
 class _Joint(NamedTuple):
     """The joint above a link."""
 
+    #: of the joint
     name: str
+    #: ``type`` in the URDF, such as ``fixed``
     kind: str
+    #: name of the link above
     parent: str
     #: v_parent = rotation v_child, (3, 3)
     rotation: Array

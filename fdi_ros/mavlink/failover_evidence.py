@@ -153,6 +153,7 @@ class Track:
     nearest: Vector = UNKNOWN_RATES  #: Difference to the nearest partner, rad/s.
     bound: float = math.nan  #: A bound on that, rad/s.
     sizes: Vector = UNKNOWN_RATES  #: Largest difference of late, by axis, rad/s.
+    #: IMUs with which this one is compared
     partners: Partners = NO_PARTNERS
     #: When each axis was last not named, or became FAULTY.
     unnamed_at: list[int] = field(default_factory=lambda: [0] * 3)

@@ -136,6 +136,7 @@ class Imu(NamedTuple):
 class View(NamedTuple):
     """All that is known now. Times in ns."""
 
+    #: in the order of their numbers
     imus: tuple[Imu, ...]
     linked: bool = False  #: An ArduPilot that sends SCALED_IMU is heard.
     armed: bool = False  #: By the last heartbeat, which may be 1 s old.
@@ -150,7 +151,9 @@ class View(NamedTuple):
 class Memory:
     """Memory of one IMU between ticks. Times in ns."""
 
+    #: Out of use by our order, or perhaps so, as defined above.
     ours: bool = False
+    #: Wanted out of use.
     held: bool = False
     seen: bool | None = None  #: INS_USE as last reported. None: not since the boot.
     out_sent: int = LONG_AGO  #: When the last order "out of use" was sent.
@@ -158,6 +161,7 @@ class Memory:
     tries: int = 0  #: Copies sent of the present order.
     obeyed: bool | None = None  #: Whether the last order was. None: not known.
     taken: int = 0  #: Number of times taken out in this flight.
+    #: Somebody else has set INS_USE: no order until the vehicle is disarmed.
     left_alone: bool = False
     without_notch: bool = False  #: Ours, and out of use at the autopilot's last start.
     acquainted: bool = False  #: Has once agreed with another IMU for `ACQUAINTED`.
@@ -170,13 +174,16 @@ class Order(NamedTuple):
     """One parameter to set now."""
 
     imu: int  #: From 0.
+    #: The wanted INS_USE.
     use: bool
 
 
 class PolicyState(NamedTuple):
     """Memory between two ticks."""
 
+    #: One for each IMU.
     memories: tuple[Memory, ...]
+    #: Number of starts of the autopilot seen at the last tick.
     boots: int = 0
 
     @classmethod
@@ -213,7 +220,9 @@ class PolicyState(NamedTuple):
 class Decision(NamedTuple):
     """Result of one tick."""
 
+    #: To be sent now.
     orders: tuple[Order, ...]
+    #: For the next tick.
     state: PolicyState
     hurry: bool  #: All INS_USE should be read at once: an order may depend on them.
 

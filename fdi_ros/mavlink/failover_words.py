@@ -108,6 +108,7 @@ class Note(NamedTuple):
 class Announced(NamedTuple):
     """The last announcement about one IMU or the vehicle."""
 
+    #: What was announced.
     condition: Condition
     at: int  #: Time, ns.
 
@@ -115,8 +116,11 @@ class Announced(NamedTuple):
 class WordsState(NamedTuple):
     """Memory between two ticks."""
 
+    #: One for each IMU.
     notes: tuple[Note, ...]
+    #: Last announcements, by the number of the IMU, from 0, or `VEHICLE`.
     announced: Mapping[int, Announced] = {}
+    #: Number of starts of the autopilot seen at the last tick.
     boots: int = 0
     at: int = LONG_AGO  #: Time of the last tick, ns.
 

@@ -44,7 +44,9 @@ MOST_UNITS = 4
 class ImuMessage(NamedTuple):
     """Layout of one message."""
 
+    #: As in MAVLink, such as SCALED_IMU.
     name: str
+    #: Number of the message in MAVLink.
     number: int
     kind: str  #: Messages of one kind bring several units of one sort.
     #: Bytes of the payload with extensions. MAVLink 2 drops zeros at the end.
@@ -186,9 +188,13 @@ _HOPEFUL = ("not asked yet", COMMAND_RESULTS[5])
 
 @dataclass
 class _Wanted:
-    interval: int  # us, or `DEFAULT_INTERVAL`
-    answer: str = _HOPEFUL[0]  # of the autopilot
-    asked: int = 0  # time of the last request, ns
+    #: us, or `DEFAULT_INTERVAL`
+    interval: int
+    #: of the autopilot
+    answer: str = _HOPEFUL[0]
+    #: time of the last request, ns
+    asked: int = 0
+    #: number of requests without an answer
     tries: int = 0
 
 

@@ -89,6 +89,7 @@ class VehicleSettings:
 class UnitTrack:
     """State of one IMU."""
 
+    #: Number of samples that arrived.
     received: int = 0
     repeated: int = 0  #: Samples at or before the time of the last one.
     impossible: int = 0  #: Samples at impossible times.

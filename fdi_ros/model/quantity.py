@@ -19,6 +19,7 @@ class Quantity(NamedTuple):
     """
 
     name: str  #: as in ``a gyro``
+    #: of the values, as in reports
     unit: str
     natural: float  #: stands for 1 rad/s, in the unit
     gain_is_fault: bool

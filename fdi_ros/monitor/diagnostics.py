@@ -67,10 +67,15 @@ class Level(IntEnum):
 class StatusLine(NamedTuple):
     """One diagnostic_msgs/DiagnosticStatus."""
 
+    #: severity
     level: Level
+    #: of the channel, the input or the monitor
     name: str
+    #: state in words
     message: str
+    #: of the unit or the vehicle, may be empty
     hardware_id: str = ""
+    #: pairs of key and value
     values: tuple[tuple[str, str], ...] = ()
 
     def value(self, key: str) -> str:

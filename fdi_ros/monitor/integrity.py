@@ -43,21 +43,29 @@ _erfc = np.frompyfunc(math.erfc, 1, 1)
 class ProtectionLevel:
     """What holds for one set of fused channels."""
 
-    level: Array  # (3,) protection level of the body axes, rad/s, inf if none exists
+    #: (3,) protection level of the body axes, rad/s, inf if none exists
+    level: Array
     limit: Array
     """(n,) largest residual of each channel that passes the separation test, rad/s, inf for channels not fused, and
     for channels that no others check."""
-    share: Array  # (n, 3) weight of the variance of each channel in the square of the level of each axis, at most
+    #: (n, 3) largest weight of the variance of each channel in the square of the level
+    #: of each axis
+    share: Array
 
 
 class _Modes(NamedTuple):
     """Fault modes: h sets of channels."""
 
-    prior: Array  # (h,)
-    sigma: Array  # (h, 3) standard deviation of the rate without them, rad/s
-    sigma_share: Array  # (h, 3, k) share of its square that is due to each channel
-    limit: Array  # (h, 3) largest separation that passes the test, rad/s, inf where the rest gives no rate
-    # (h, 3, k) part of that which is due to each channel's variance, rad/s
+    #: (h,) probability of each mode
+    prior: Array
+    #: (h, 3) standard deviation of the rate without them, rad/s
+    sigma: Array
+    #: (h, 3, k) share of its square that is due to each channel
+    sigma_share: Array
+    #: (h, 3) largest separation that passes the test, rad/s, inf where the rest gives
+    #: no rate
+    limit: Array
+    #: (h, 3, k) part of that which is due to each channel's variance, rad/s
     limit_share: Array
 
 

@@ -53,9 +53,13 @@ class Event:
     """One change of state of one channel."""
 
     stamp: int  #: Stamp of the sample that brought the change, ns.
+    #: Number of the channel, gyros first.
     channel: int
+    #: State until then.
     before: ChannelState
+    #: State from then on.
     after: ChannelState
+    #: Why the state changed.
     reason: Reason
     group: tuple[
         int, ...
@@ -286,22 +290,28 @@ Template = ImuTemplate | ChannelsTemplate
 class Topic(NamedTuple):
     """One topic that a monitor publishes."""
 
-    name: str  # name before remapping
-    type: str  # of its messages: ``sensor_msgs/msg/Imu``
+    #: name before remapping
+    name: str
+    #: of its messages: ``sensor_msgs/msg/Imu``
+    type: str
 
 
 class Rows(NamedTuple):
     """What one sample gave: records of `fdi_ros.core.records.OutputRow`."""
 
+    #: record of the gyros
     gyros: Any
-    accelerometers: Any = None  # None: there are none
-    natural: float = FORCE.natural  # unit of the latter's figures, m/s^2
+    #: record of the accelerometers. None: there are none
+    accelerometers: Any = None
+    #: unit of the accelerometers' figures, m/s^2
+    natural: float = FORCE.natural
 
 
 @dataclass(frozen=True, eq=False)
 class SampleOutput:
     """A message about each sample, on a topic of its own."""
 
+    #: on which the messages are published
     topic: Topic
     make: Callable[[str, Sequence[str], int], Template]
     """Returns a message to be filled, from the frame_id of the rate, the names of all channels, and the number of
@@ -309,8 +319,10 @@ class SampleOutput:
     fill: Callable[[Template, Rows, int, int, int], None]
     """Fills the message from rows, the numbers of gyros and accelerometers, and the shift in ns to subtract from its
     stamp."""
-    needs_rate: bool = False  # whether only samples with a fused rate are published
-    on_demand: bool = False  # whether the node skips the output without subscribers
+    #: whether only samples with a fused rate are published
+    needs_rate: bool = False
+    #: whether the node skips the output without subscribers
+    on_demand: bool = False
 
 
 def _fill_fused(out: Template, rows: Rows, n: int, m: int, shift: int) -> None:

@@ -73,8 +73,11 @@ NEVER_NOISY = NoisySpell(0, 0, 0, 0.0)
 class ChannelStatus:
     """Present state of one channel."""
 
+    #: Such as ``imu_1.x``.
     name: str
+    #: At the last sample.
     state: ChannelState
+    #: Why the channel has that state.
     reason: Reason
     since: int  #: Stamp of the sample that brought the state, ns, 0 before the first sample.
     group: tuple[str, ...]  #: AMBIGUOUS: names of the set one of which is faulty.
@@ -118,12 +121,20 @@ class ChannelStatus:
 class UnitStatus:
     """One unit as a whole: the channels that share their stamps."""
 
+    #: Such as ``imu_1``.
     name: str
+    #: Names of its channels.
     channels: tuple[str, ...]
-    delay: float  # lateness of its stamps against another unit, s. Negative if early, NaN if not measured
-    delay_std: float  # standard deviation of that, s
-    against: str  # the other unit: with two units the first, with more the middle one, which names itself
-    taken_off: bool = False  # whether the certain part of the delay is corrected
+    #: Lateness of its stamps against another unit, s. Negative if early, NaN if not
+    #: measured.
+    delay: float
+    #: Standard deviation of the delay, s.
+    delay_std: float
+    #: The other unit: with two units the first, with more the middle one, which names
+    #: itself.
+    against: str
+    #: Whether the certain part of the delay is corrected.
+    taken_off: bool = False
     frozen: float = 0.0
     """Time for which all its values have repeated while the others measure motion, s, 0 if shorter than
     ``health.stuck_time``."""
@@ -136,10 +147,15 @@ class ApartStatus:
     One is faulty, and no evidence tells which.
     """
 
+    #: Names of the two.
     channels: tuple[str, str]
-    who: str  # the two in words
-    size: float  # by how much they differ, in the unit
-    std: float  # standard deviation of the difference, NaN if unknown
+    #: The two in words.
+    who: str
+    #: By how much they differ, in ``unit``.
+    size: float
+    #: Standard deviation of the difference, in ``unit``, NaN if unknown.
+    std: float
+    #: rad/s of gyros, m/s^2 of accelerometers.
     unit: str = RATE.unit
 
     def __str__(self) -> str:
@@ -150,12 +166,20 @@ class ApartStatus:
 class ErrorStatus:
     """What is known of one error of a channel or a unit."""
 
-    owner: str  # name of the channel, or of the unit
-    kind: str  # name in `fdi_ros.estimator.error_states.ERROR_KINDS`, with x, y or z if the error has three components
+    #: Name of the channel, or of the unit.
+    owner: str
+    #: Name in `fdi_ros.estimator.error_states.ERROR_KINDS`, with x, y or z if the error
+    #: has three components.
+    kind: str
+    #: Of value, std and prior. Empty: dimensionless.
     unit: str
+    #: Estimated error.
     value: float
+    #: Standard deviation of the estimate.
     std: float
-    prior: float  # standard deviation by now if nothing had been measured: at the start, and its walk since
+    #: Standard deviation by now if nothing had been measured: at the start, and its
+    #: walk since.
+    prior: float
 
     @property
     def is_unusual(self) -> bool:
@@ -178,12 +202,17 @@ class ErrorStatus:
 class Status:
     """State of the whole monitor after the last sample."""
 
+    #: Settings of the monitor.
     config: Config = field(repr=False)
     stamp: int  #: Of the last sample, ns, 0 before the first.
+    #: Number of samples so far.
     samples: int
+    #: ``detector.name``.
     detector: str
     channels: tuple[ChannelStatus, ...]  #: Gyros, then accelerometers.
+    #: Of the last sample. An alarm is a statistic at the threshold or above.
     statistic: float
+    #: Of the statistic.
     threshold: float
     has_rate: bool  #: Whether the last sample gave a fused rate.
     withheld: bool  #: Whether a rate was withheld because of old values or doubted channels (``publish_under_doubt``).

@@ -38,14 +38,18 @@ AFTER = 40 * NS  #: and at this time after it, ns: longer than every pause.
 
 
 class _Sample(NamedTuple):
-    at: int  # time of the policy, ns
-    rates: list[float]  # rad/s; NaN: not delivered
+    #: time of the policy, ns
+    at: int
+    #: of each channel, rad/s. NaN: not delivered
+    rates: list[float]
+    #: numbers of `ChannelState` of each channel
     states: list[float]
 
 
 class _Done(NamedTuple):
     """An order of failover."""
 
+    #: what was done, for a report
     words: str
     #: from the first sample, ns
     at: int

@@ -529,8 +529,11 @@ def added(a: Any, b: Any) -> Any:
 class Estimate:
     """A figure with its 95 % interval. NaN: no trials."""
 
+    #: The figure.
     value: float
+    #: Lower end of the interval.
     low: float
+    #: Upper end of the interval.
     high: float
 
 

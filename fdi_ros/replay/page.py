@@ -77,11 +77,17 @@ SHOWN_AROUND = 2.0
 class Words(NamedTuple):
     """Titles of the plots of gyros or accelerometers."""
 
+    #: short name of the fused vector
     vector: str
+    #: title of the plot of the statistic
     statistic: str
+    #: title of the plot of the fused vector
     fused: str
+    #: title of the plot of the residuals
     residuals: str
+    #: title of the plot of the spectrum
     spectrum: str
+    #: title of the plot of the protection level
     level: str
 
 

@@ -83,22 +83,37 @@ HOLE_INTERVALS = 5.0
 class _Open:
     """An episode with a standing declaration."""
 
+    #: declared state
     kind: ChannelState
+    #: numbers of the channels in its last step
     members: set[int]
+    #: time of the first step, s
     start: float
+    #: time of the last step, s
     since: float
+    #: of the first step, in words
     reason: str
+    #: standard deviation of the fused rate before the episode, rad/s. NaN: no rate
     std_before: float
+    #: whether it began just after a hole in the samples
     after_hole: bool
+    #: declarations that followed each other
     steps: list[Step] = field(default_factory=list)
     batches: dict[tuple[int, ...], Batches] = field(default_factory=dict)
     """Errors of single channels, and differences of pairs that measure one axis."""
+    #: largest statistic over threshold. NaN: none
     ratio: float = float("nan")
+    #: number of samples with an alarm
     alarms: int = 0
+    #: time of the last alarm, s. None: none
     last_alarm: float | None = None
+    #: number of samples
     samples: int = 0
+    #: number of samples with a fused rate
     with_rate: int = 0
+    #: sum of the traces of the covariance of these, (rad/s)^2
     variance: float = 0.0
+    #: largest protection level, rad/s
     level: float = 0.0
 
 

@@ -68,6 +68,7 @@ FORCE_UNITS = {"rad/s": "m/s^2", "rad/s^2": "m/s^3"}
 class Swept:
     """One kind of fault with one size."""
 
+    #: name in `FAULT_KINDS`, such as ``bias``
     kind: str
     items: tuple[tuple[str, str], ...]
     """Its numbers by name, as the user wrote them."""
@@ -160,6 +161,7 @@ def parse_swept(text: str) -> tuple[Swept, ...]:
 class Plan:
     """Faults, start times and detection time of a sweep."""
 
+    #: kinds and sizes to be tried
     faults: tuple[Swept, ...]
     times: int = 10
     """Number of start times per channel, spread over the recording."""
@@ -176,10 +178,11 @@ class Plan:
 class Baseline:
     """Result for a recording without injected faults."""
 
+    #: as of any replay
     judgement: Judgement
     judged: float
     """Share of judged samples."""
-    # (N,) a channel stands declared, by itself or in a set, or gives nothing
+    #: (N,) a channel stands declared, by itself or in a set, or gives nothing
     doubtful: Mask
     speed: Array
     """(N,) norm of the fused rate, rad/s. NaN: no rate."""
@@ -284,9 +287,13 @@ class Onset:
 class Trial:
     """One fault with its result."""
 
+    #: number of the faulty channel
     channel: int
+    #: kind and size of the fault
     swept: Swept
+    #: as injected
     fault: Fault
+    #: what the monitor made of it
     scored: Scored
 
 
@@ -399,12 +406,14 @@ def monitor_of(config: Config) -> Pipeline:
 class Subject:
     """A monitor with its aligned samples. `sweep` adds the results."""
 
+    #: of the monitor in the report
     name: str
+    #: settings of the monitor
     config: Config
+    #: its samples, aligned
     block: Block
-    channels: tuple[
-        str, ...
-    ] = ()  # names of all channels. Those excluded are tried with no fault
+    #: names of all channels. Those excluded are tried with no fault
+    channels: tuple[str, ...] = ()
     gyros: int = 0
     """Number of the channels that are gyros, the first ones."""
     felt: tuple[int, ...] = ()
@@ -419,9 +428,9 @@ class Subject:
     """Start times of the faults, s."""
     skipped: tuple[float, ...] = ()
     """Times without faults, because a channel was already declared or silent, s."""
-    speeds: tuple[
-        float, ...
-    ] = ()  # largest fused rate while the faults of each time are watched, rad/s; 0: none
+    #: largest fused rate while the faults of each time are watched, rad/s. 0: none
+    speeds: tuple[float, ...] = ()
+    #: one for each injected fault
     trials: tuple[Trial, ...] = ()
 
     @property

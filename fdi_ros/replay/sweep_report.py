@@ -38,7 +38,9 @@ NOT_ORDERED = ("saturation",)
 class Delays(NamedTuple):
     """Quantiles of a delay over all trials, s. Infinite: fewer trials have a delay."""
 
+    #: half of all trials have at most this delay, s
     median: float
+    #: 95 % of all trials have at most this delay, s
     p95: float
 
 
@@ -46,7 +48,9 @@ class Delays(NamedTuple):
 class Line:
     """Results for one kind and size, over channels and times."""
 
+    #: kind and size of the fault
     swept: Swept
+    #: number of trials
     trials: int
     counts: dict[str, int]
     """Number of trials by outcome."""

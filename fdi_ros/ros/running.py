@@ -71,10 +71,14 @@ BY_SEVERITY = (
 class _Line:
     """The last line of the log about a channel."""
 
+    #: as logged
     state: ChannelState = ChannelState.UNCHECKED
-    until: float = 0.0  # when the next one may come, s
-    left_out: int = 0  # changes since that were not logged
-    present: ChannelState = ChannelState.UNCHECKED  # state after these
+    #: when the next line may come, s
+    until: float = 0.0
+    #: number of changes since then that were not logged
+    left_out: int = 0
+    #: state after these changes
+    present: ChannelState = ChannelState.UNCHECKED
 
 
 class ChangeLog:

@@ -76,8 +76,11 @@ WIDE = 90  # columns from which the biases have room
 class Change(NamedTuple):
     """Channels with the same change of state. The time counts in s since 1970."""
 
+    #: time, s since 1970
     at: float
+    #: severity of the new state
     level: Level
+    #: channels and new state
     words: str
 
 
@@ -85,21 +88,27 @@ class Change(NamedTuple):
 class Picture:
     """The newest messages of a monitor, one of each kind."""
 
-    monitor: str = ""  # full name of the node
-    caption: str = ""  # notice above all others, or empty
-    waiting: str = "looking for a monitor"  # name of the awaited monitor, or empty
-    since: float = field(
-        default_factory=time.monotonic
-    )  # start of the wait, s, monotonic clock
+    #: full name of the node
+    monitor: str = ""
+    #: notice above all others, or empty
+    caption: str = ""
+    #: name of the awaited monitor, or empty
+    waiting: str = "looking for a monitor"
+    #: start of the wait, s, monotonic clock
+    since: float = field(default_factory=time.monotonic)
+    #: line about the monitor as a whole
     whole: StatusLine = field(
         default_factory=lambda: StatusLine(Level.STALE, MONITOR_LINE, "")
     )
-    channels: Mapping[str, StatusLine] = field(default_factory=dict)  # by name
+    #: line of each channel, by its name
+    channels: Mapping[str, StatusLine] = field(default_factory=dict)
+    #: lines about the input topics
     inputs: Sequence[StatusLine] = ()
-    rate: tuple[float, float, float] | None = None  # fused rate, rad/s
-    heard: dict[str, float] = field(
-        default_factory=dict
-    )  # when the last message of each kind came, s, monotonic clock
+    #: fused rate, rad/s. None: none came yet
+    rate: tuple[float, float, float] | None = None
+    #: when the last message of each kind came, s, monotonic clock
+    heard: dict[str, float] = field(default_factory=dict)
+    #: the last changes of state, the newest last
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=KEPT_CHANGES))
 
     def is_silent(self, kind: str) -> bool:

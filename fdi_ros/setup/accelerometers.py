@@ -74,11 +74,13 @@ class AccelerometerFit(ChannelFit):
 class Prepared:
     """The accelerometers of a recording, ready for the estimate."""
 
+    #: of the channels in use
     names: tuple[str, ...]
     #: (n,) numbers of the channels in use among those of all units of the config
     active: Int
     #: (N, n) over `FORCE.natural`, less what the turning of the body adds
     data: Data
+    #: for the estimate
     priors: Priors
     #: (N, n) samples left out as spikes
     spiky: Mask

@@ -97,6 +97,7 @@ REPLACED = (
 class StampDelay(NamedTuple):
     """By how much the stamps of a unit are late against those of the first."""
 
+    #: numbers of the channels of the unit
     channels: tuple[int, ...]
     #: s, positive if stamps are late, as in imus.delays
     value: float
@@ -112,8 +113,11 @@ class StampDelay(NamedTuple):
 class Span(NamedTuple):
     """Channels of which one is faulty, from start to end, s from the start of the part used."""
 
+    #: numbers of the channels
     channels: tuple[int, ...]
+    #: begin, s
     start: float
+    #: end, s
     end: float
 
 
@@ -125,6 +129,7 @@ class Calibration(ChannelFit):
     timing: float
     #: of all units but the first
     delays: tuple[StampDelay, ...]
+    #: when channels were faulty
     faults: tuple[Span, ...]
     #: of the recording, s
     duration: float

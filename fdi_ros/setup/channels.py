@@ -22,9 +22,11 @@ UNMEASURED = SCALE_STD / 2
 class ChannelFit:
     """Channels in use, in their order, and what a recording shows of their errors."""
 
+    #: of the channels
     names: tuple[str, ...]
     #: (n, 3) as configured
     nominal: Array
+    #: errors of the channels with their covariance
     estimate: StateEstimate
     #: (n,) samples of each channel that were not used, by the reason: as of `Data`, and
     #: spikes

@@ -113,12 +113,15 @@ def smallest_shift(samples: float, run_length: float) -> float:
 class Loss(NamedTuple):
     """Performance after the loss of some channels."""
 
+    #: numbers of the lost channels
     lost: tuple[int, ...]
     #: infinite where the rest does not span space
     gdop: float = math.inf
     #: (3,) of the rate about each body axis at rest, rad/s
     std: Array = np.full(3, np.inf)
+    #: numbers of the channels whose fault would be detected
     detectable: tuple[int, ...] = ()
+    #: numbers of the channels whose fault would be isolated
     isolable: tuple[int, ...] = ()
 
 
@@ -126,7 +129,9 @@ class Loss(NamedTuple):
 class Mounting:
     """Consequences of geometry and noise at rest."""
 
+    #: of all channels
     geometry: Geometry
+    #: of all channels
     noise: NoiseModel
     #: per sample
     false_alarm_probability: float

@@ -420,10 +420,14 @@ def _span_words(span: Span, names: Sequence[str]) -> str:
 class _Bound(NamedTuple):
     """Values of channels, and the bound beyond which they are worth a look."""
 
+    #: finding in words
     what: str
+    #: (n,) of the channels
     values: Array
+    #: largest usual absolute value
     bound: float
     form: str  #: of one value, after multiplication by `factor`
+    #: from the unit of the values to the unit of the form
     factor: float
 
 

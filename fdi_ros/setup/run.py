@@ -91,6 +91,7 @@ class Tried:
 
     #: result without test faults, None if nothing is judged
     baseline: Baseline | None
+    #: what kept the proof from being complete, or empty
     note: str
     #: by size, rad/s: biases isolated and tried; empty if the recording is too short
     isolated: dict[float, tuple[int, int]]
@@ -133,8 +134,11 @@ class Proof:
     source: str
     #: whether the settings are from other samples
     apart: bool
+    #: length of the recording or of the part, s
     seconds: float
+    #: with the settings from before
     before: Tried
+    #: with the new settings
     after: Tried
 
     @property
@@ -214,7 +218,9 @@ class LearnedSettings:
 
     #: ``{"section.field": value}`` of the config
     parameters: Parameters
+    #: with these parameters
     config: Config
+    #: behind the config. None: there is none
     calibration: Calibration | None = None
     #: error that prevented a calibration
     why: FdiError | None = None
@@ -238,6 +244,7 @@ class SetupResult(LearnedSettings):
 
     #: reason to keep the settings before, or empty
     kept: str
+    #: what geometry and noise of the config allow
     mounting: Mounting
     #: performance of the settings
     proof: Proof
@@ -245,6 +252,7 @@ class SetupResult(LearnedSettings):
     replayed: Baseline | None = None
     #: of all topics
     reports: Sequence[TopicReport] = ()
+    #: unreadable parts of the recording, a sentence each
     damage: tuple[str, ...] = ()
     #: gyros that cannot be read as such, and why
     unread: tuple[tuple[str, str], ...] = ()
