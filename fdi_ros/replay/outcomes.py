@@ -60,8 +60,8 @@ def outcome_of(
     return OutcomeKind.FALSE_GROUP if false_group else OutcomeKind.MISSED
 
 
-class Scored(NamedTuple):
-    """Result for one fault, with times."""
+class TrialOutcome(NamedTuple):
+    """Result of one trial of a sweep or a study: what is known from the states alone."""
 
     outcome: OutcomeKind
     """The result."""
@@ -80,7 +80,7 @@ def standing(output: Output) -> tuple[Mask, Mask]:
 
 def score(
     alone: Mask, among: Mask, channel: int | None, since: Array, within: float = np.inf
-) -> Scored:
+) -> TrialOutcome:
     """Return the result for a fault.
 
     Parameters
@@ -106,7 +106,7 @@ def score(
         bool(among[:, own][soon].any()),
         bool(among[soon].any()),
     )
-    return Scored(outcome, isolated, detected)
+    return TrialOutcome(outcome, isolated, detected)
 
 
 def _first(declared: Mask, since: Array) -> float:

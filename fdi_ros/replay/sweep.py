@@ -32,8 +32,8 @@ from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import pieces
 from fdi_ros.replay.outcomes import (
     DECLARED_STATES,
-    Scored,
     StateChange,
+    TrialOutcome,
     score,
     standing,
 )
@@ -294,7 +294,7 @@ class Trial:
     #: as injected
     fault: Fault
     #: what the monitor made of it
-    scored: Scored
+    scored: TrialOutcome
 
 
 def onsets_of(

@@ -20,7 +20,7 @@ from fdi_ros.errors import FaultError
 from fdi_ros.faults.fault import Injector, load_scenario
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.replay.outcomes import OutcomeKind, Scored, score
+from fdi_ros.replay.outcomes import OutcomeKind, TrialOutcome, score
 from fdi_ros.replay.sweep import (
     Plan,
     Subject,
@@ -120,7 +120,7 @@ def test_outcome_of_a_fault(alone, among, words, named, found):
     for mask, told in zip(masks, (alone, among), strict=True):
         for channel, at in told.items():
             mask[since >= at - 1e-9, channel] = True
-    assert score(*masks, 0, since, 2.0) == Scored(
+    assert score(*masks, 0, since, 2.0) == TrialOutcome(
         OutcomeKind(words), pytest.approx(named), pytest.approx(found)
     )
 
