@@ -4,6 +4,7 @@
 """Times of the failover policy, each from both sides: one step earlier nothing happens."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 
@@ -158,3 +159,80 @@ def test_a_reserve_that_is_not_ok_is_fine_where_the_bad_one_is_off_most(
     memories = (Memory(seen=True), Memory(seen=True), OUT)
     words = objection(0, memories, view, START, PolicySettings())
     assert words == ("" if is_sound else "no sound IMU reported in use")
+
+
+SOUND = Imu(True, delivers=True, ok=True, size=0.0)
+BAD = Imu(True, named=True, blamed=True, worst="y", delivers=True, size=0.4, least=0.4)
+
+
+def decided(memories, imus, now, heard=0, **view):
+    """Decision in flight about IMUs whose use was reported some time ago, ns."""
+    imus = tuple(imu._replace(heard=now - heard) for imu in imus)
+    known = {"linked": True, "armed": True, "monitored": True, **view}
+    state = PolicyState(tuple(memories))
+    return decide(state, View(imus, **known), now, PolicySettings())
+
+
+def in_use(count):
+    return tuple(Memory(seen=True) for _ in range(count))
+
+
+@pytest.mark.parametrize(("age", "goes_out"), [(190, True), (210, False)])
+def test_a_reserve_was_reported_in_use_within_a_fifth_of_a_second(age, goes_out):
+    decision = decided(in_use(3), (BAD, SOUND, SOUND), START, age * MS)
+    assert bool(decision.orders) == goes_out
+
+
+def test_an_order_is_repeated_ten_times_a_second_and_after_ten_times_once_a_second():
+    memories, times = in_use(3), []
+    for now in range(START, START + 4000 * MS, 10 * MS):
+        decision = decided(memories, (BAD, SOUND, SOUND), now)
+        memories = decision.state.memories
+        times += [now] * len(decision.orders)
+    pauses = [(b - a) // MS for a, b in pairwise(times)]
+    assert pauses[:12] == [100] * 9 + [1000] * 3
+
+
+@pytest.mark.parametrize(("waited", "ours"), [(1900, True), (2100, False)])
+def test_an_imu_is_ours_until_two_seconds_after_our_last_order_out(waited, ours):
+    back = replace(OUT, held=False, back_sent=START + 500 * MS)
+    assert tick(back, START + waited * MS, use=True).ours == ours
+
+
+@pytest.mark.parametrize(("disarmed", "alone"), [(1900, True), (2100, False)])
+def test_an_imu_is_left_alone_until_two_seconds_after_the_flight(disarmed, alone):
+    memories = (Memory(seen=True, left_alone=True), *in_use(2))
+    ground = {"armed": False, "disarmed": disarmed * MS}
+    decision = decided(memories, (SOUND,) * 3, START, **ground)
+    assert decision.state.memories[0].left_alone == alone
+
+
+@pytest.mark.parametrize(("agreed", "known"), [(4900, False), (5100, True)])
+def test_an_imu_is_acquainted_after_five_seconds_of_agreement(agreed, known):
+    one = SOUND._replace(agreed=START - agreed * MS)
+    decision = decided(in_use(3), (one, SOUND, SOUND), START)
+    assert decision.state.memories[0].acquainted == known
+
+
+@pytest.mark.parametrize(("waited", "held"), [(900, True), (1100, False)])
+def test_an_imu_goes_back_when_all_others_were_dead_for_a_second(waited, held):
+    out = SOUND._replace(use=False, ok=False, size=0.4, least=0.4)
+    dead = SOUND._replace(delivers=False)
+    memories = (OUT, *in_use(2))
+    for now in (START + 5000 * MS, START + (5000 + waited) * MS):
+        memories = decided(memories, (out, dead, dead), now).state.memories
+    assert memories[0].held == held
+
+
+@pytest.mark.parametrize(
+    ("least", "waited", "held"),
+    [(0.095, 1100, False), (0.095, 900, True), (0.105, 1100, True)],
+)
+def test_an_imu_goes_back_that_is_off_by_a_quarter_of_those_in_use_for_a_second(
+    least, waited, held
+):
+    out = SOUND._replace(use=False, ok=False, size=0.4, least=least)
+    memories = (OUT, *in_use(2))
+    for now in (START + 5000 * MS, START + (5000 + waited) * MS):
+        memories = decided(memories, (out, BAD, BAD), now).state.memories
+    assert memories[0].held == held

@@ -17,8 +17,6 @@ from fdi_ros.replay.episodes import (
     join_halves,
 )
 from fdi_ros.replay.recurring import (
-    LEAST_SETS,
-    RECURS_WITHIN,
     NoisyTime,
     join_noise,
     join_recurring,
@@ -82,18 +80,33 @@ def test_sets_that_come_and_go_are_one_of_the_unit_in_all_of_them():
     [
         episode(8.0, state="FAULTY"),
         episode(8.0, channels=("imu_1.x", "imu_2.x")),
-        episode(7.4 + RECURS_WITHIN + 0.01),
+        episode(7.4 + 2.05),
         episode(8.0, stretch=2),
         episode(8.0, channels=FORCES),
     ],
 )
 def test_what_may_be_another_fault_stays_an_episode(last):
-    run = [*(episode(5.0 + k) for k in range(LEAST_SETS - 1)), last]
+    run = [*(episode(5.0 + k) for k in range(2)), last]
     assert join_recurring(run, UNIT_OF) == run
     third = replace(run[1], start_s=7.0, since_s=7.0, end_s=7.4)
     third = replace(third, steps=(Step(7.0, "AMBIGUOUS", GYROS, "a set"),))
     whole, other = join_recurring([*run[:2], third, last], UNIT_OF)
     assert (whole.sets, other) == (3, last)
+
+
+@pytest.mark.parametrize(("pause", "sets"), [(1.95, 3), (2.05, 1)])
+def test_sets_recur_within_two_seconds(pause, sets):
+    run = [episode(5.0 + k * (0.4 + pause)) for k in range(3)]
+    assert join_recurring(run, UNIT_OF)[0].sets == sets
+
+
+@pytest.mark.parametrize(("length", "joined"), [(0.1, 1), (0.08, 4)])
+def test_a_unit_explains_sets_in_which_it_was_for_nine_tenths_of_the_time(
+    length, joined
+):
+    """The last 10 ms of each set are of a channel of another unit."""
+    run = [episode(5.0 + k, length=length, last=("imu_1.x",)) for k in range(4)]
+    assert len(join_recurring(run, UNIT_OF)) == joined
 
 
 def test_sets_of_two_units_are_of_either():
@@ -158,7 +171,7 @@ def test_noise_tells_which_unit_of_a_set_is_loose():
         (episode(6.0), noise("imu_3.x")),
         (episode(6.0), noise("imu_2.x", "imu_2.y")),
         (episode(6.0), noise("imu_3.x", "imu_3.y", "imu_2.x")),
-        (episode(6.0), noise("imu_3.x", "imu_3.y", since=6.4 + RECURS_WITHIN + 0.1)),
+        (episode(6.0), noise("imu_3.x", "imu_3.y", since=8.5)),
         (episode(6.0), noise("imu_3.x", "imu_3.y", since=2.0)),
         (episode(6.0), noise("imu_3.x", "imu_3.y", until=6.9 + LEAST_NOISY_S)),
         (episode(6.0), noise(*FORCES, half="m/s^2")),
