@@ -6,16 +6,13 @@
 from collections.abc import Sequence
 from itertools import pairwise
 
-from fdi_ros.mavlink.failover_probe import (
-    ANSWERED,
-    PROBE_AGAIN,
-    PROBE_QUIET,
-    Probe,
-    probe,
-)
+from fdi_ros.mavlink.failover_probe import Probe, probe
 
 MS = 1_000_000
 NS = 1000 * MS
+PROBE_QUIET = 500 * MS
+ANSWERED = NS
+PROBE_AGAIN = 5 * NS
 TICK = 20 * MS
 
 
@@ -64,8 +61,11 @@ def test_one_that_is_not_answered_stays_unknown_and_is_tried_again() -> None:
     talk.answers[1] = False
     assert talk.run(20.0) == (True, None, True)
     times = [at for imu, at in talk.set_at if imu == 1]
-    assert 2 <= len(times) <= 20 * NS // PROBE_AGAIN
-    assert min(b - a for a, b in pairwise(times)) >= PROBE_AGAIN + ANSWERED
+    # Each time it becomes quiet, is set, and waits for the answer.
+    pause = PROBE_QUIET + ANSWERED + PROBE_AGAIN
+    pauses = [b - a for a, b in pairwise(times)]
+    assert len(pauses) > 1
+    assert all(pause <= one <= pause + 10 * TICK for one in pauses)
 
 
 def test_while_an_order_may_follow_nothing_is_set() -> None:

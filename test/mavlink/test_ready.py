@@ -109,6 +109,21 @@ def test_a_late_answer_that_the_policy_ignores_changes_nothing() -> None:
     assert reason(memory=disputed, **late) == "IMU 2 not in use"
 
 
+@pytest.mark.parametrize(
+    ("fine", "doubtful"),
+    [
+        ({"age": 0.95}, {"age": 1.05}),
+        ({"lost": 0.095}, {"lost": 0.105}),
+        ({"trip": 295_000_000}, {"trip": 305_000_000}),
+    ],
+)
+def test_monitor_and_link_are_in_doubt_from_these_sizes_on(
+    fine: dict[str, Any], doubtful: dict[str, Any]
+) -> None:
+    assert reason(facts=fine) == ""
+    assert reason(facts=doubtful)
+
+
 def test_the_gravest_reason_comes_first() -> None:
     """A link that is silent is not slow, and an IMU has its name before a rule has its."""
     silent = {"facts": {"trip": None}, "linked": False, "monitored": False}

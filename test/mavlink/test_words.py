@@ -19,7 +19,6 @@ from fdi_ros.mavlink.failover_policy import (
 )
 from fdi_ros.mavlink.failover_ready import NO_OTHER
 from fdi_ros.mavlink.failover_words import (
-    LOST_LANE,
     VEHICLE,
     Condition,
     Note,
@@ -36,6 +35,7 @@ MS = 1_000_000
 NS = 1000 * MS
 NOW = 1000 * NS
 STEP = 100 * MS
+LOST_LANE = 1.5  # rad
 SETTINGS = PolicySettings()
 GOOD = Imu(use=True, heard=NOW, named=False, ok=True, delivers=True, size=0.0, agreed=1)
 BAD = GOOD._replace(named=True, blamed=True, ok=False, size=0.5, agreed=None)
@@ -196,7 +196,7 @@ def test_a_monitor_that_flickers_does_not_flood_the_pilot() -> None:
     for k in range(100):
         imu = GOOD._replace(named=k % 2 == 0, ok=False, agreed=None)
         words += flight.fly(0.1, view(imu, armed=False), OUT)
-    assert 5 <= len(words) <= 11
+    assert 8 <= len(words) <= 11
 
 
 @pytest.mark.parametrize("is_out", [True, False])
@@ -215,6 +215,45 @@ def test_a_lane_that_was_misled_for_long_is_lost_until_the_landing() -> None:
         assert (VEHICLE, Condition.LAST_LANE) in words
     assert flight.fly(2.0, view(armed=False))[-1][2] is Condition.REDUNDANT
     assert not flight.fly(10.0, view())
+
+
+@pytest.mark.parametrize(("seconds", "announced"), [(4.9, False), (5.1, True)])
+def test_a_difference_is_announced_after_five_seconds(
+    seconds: float, announced: bool
+) -> None:
+    note = Note(apart_since=NOW - round(seconds * NS))
+    memories = (USED,) * 3
+    found = imu_condition(
+        0, (note, Note(), Note()), memories, view(APART), NOW, SETTINGS
+    )
+    assert (found is Condition.APART) == announced
+    waits = Note(waits_since=NOW - round(seconds * NS))
+    memories = (OUT, USED, USED)
+    found = imu_condition(
+        0, (waits, Note(), Note()), memories, view(WAITING), NOW, SETTINGS
+    )
+    assert (found is Condition.WAITS) == announced
+
+
+def lane_lost_at(flight: Flight) -> float:
+    """Return when the last lane is lost, s from now, of two IMUs that are off by 0.5 rad/s."""
+    found = flight.fly(10.0, view(BAD, BAD))
+    return next(at for at, _, what in found if what is Condition.LAST_LANE)
+
+
+def test_a_lane_is_lost_that_was_misled_by_one_and_a_half_rad() -> None:
+    flight = Flight()
+    flight.fly(1.0, view())
+    assert lane_lost_at(flight) == pytest.approx(3.0, abs=0.15)
+
+
+def test_a_lane_recovers_within_ten_seconds() -> None:
+    """Of 1 rad 0.6 rad are left after 5 s, and 1.8 s at 0.5 rad/s bring it to 1.5 rad."""
+    flight = Flight()
+    flight.fly(1.0, view())
+    flight.fly(2.0, view(BAD, BAD))
+    flight.fly(5.0, view())
+    assert lane_lost_at(flight) == pytest.approx(1.8, abs=0.15)
 
 
 def said(*course: tuple[float, str, bool, bool]) -> list[str]:
