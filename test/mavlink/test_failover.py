@@ -24,7 +24,7 @@ import pytest
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink import kept_file
 from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
-from fdi_ros.mavlink.failover_file import FailoverFile
+from fdi_ros.mavlink.failover_file import FailoverFile, Saved
 from fdi_ros.mavlink.failover_policy import PolicySettings
 from fdi_ros.mavlink.failover_words import Condition, imu_name, text_of
 from fdi_ros.system.clocks import Clocks
@@ -1367,6 +1367,85 @@ def test_use_that_was_not_reported_for_ten_seconds_is_unknown(
     del flying.autopilots[0].parameters["INS_USE2"]
     assert reason(flying.run(9.0)) == "ready"
     assert reason(flying.run(2.0)) == "no failover: use of IMU 2 is not reported"
+
+
+def test_a_monitor_is_silent_after_five_seconds_without_diagnostics(
+    flying: Monitored,
+) -> None:
+    """Its states come on."""
+    flying.reports = False
+    assert reason(flying.run(4.5)) == "ready"
+    silent = "no failover: monitor silent or not alone"
+    assert reason(flying.run(1.0)) == silent
+
+
+def reads(talk: Monitored, seconds: float) -> int:
+    """Return how often INS_USE is asked for in a time."""
+    asked = []
+    talk.vehicle.read_parameter = asked.append
+    talk.run(seconds)
+    return asked.count("INS_USE")
+
+
+def test_use_is_read_ten_times_a_second_in_flight_and_oftener_in_doubt(
+    flying: Monitored,
+) -> None:
+    """A turn of this test takes 60 ms: it asks every second turn, or in each."""
+    assert 23 <= reads(flying, 3.0) <= 27
+    flying.states[1] = FAULTY
+    flying.run(0.2)
+    assert 48 <= reads(flying, 3.0) <= 51
+
+
+def test_use_is_read_twice_a_second_on_the_ground(flying: Monitored) -> None:
+    flying.autopilots[0].armed = False
+    flying.run(3.0)
+    assert 5 <= reads(flying, 3.0) <= 7
+
+
+def boots_after(talk: Monitored, step: float, seconds: float) -> int:
+    """Return the boots seen where the autopilot seems to have started later than known, by s."""
+    before = talk.failover._boots
+    assert talk.failover._booted is not None
+    talk.failover._booted -= round(step * NS)
+    talk.run(seconds)
+    return talk.failover._boots - before
+
+
+@pytest.mark.parametrize(
+    ("step", "seconds", "boots"), [(2.9, 12.0, 0), (3.1, 12.0, 1), (3.1, 9.0, 0)]
+)
+def test_a_time_that_is_behind_by_three_seconds_for_ten_is_a_boot(
+    flying: Monitored, step: float, seconds: float, boots: int
+) -> None:
+    assert boots_after(flying, step, seconds) == boots
+
+
+@pytest.mark.parametrize(
+    ("off", "uptime", "computer", "same"),
+    [
+        (9.5, 500.0, "a", True),
+        (10.5, 500.0, "a", False),
+        (-10.5, 500.0, "a", False),
+        # Another start of the computer: Unix time is compared.
+        (9.5, 500.0, "b", True),
+        (10.5, 500.0, "b", False),
+        # Not if the computer was started within a minute of the autopilot.
+        (0.0, 361.0, "b", True),
+        (0.0, 359.0, "b", False),
+        (0.0, 239.0, "b", True),
+        (0.0, 241.0, "b", False),
+    ],
+)
+def test_one_start_of_the_autopilot_has_one_time_within_ten_seconds(
+    tmp_path: Path, off: float, uptime: float, computer: str, same: bool
+) -> None:
+    """It started 300 s ago, by clocks that are off since the file was written."""
+    talk = Monitored(tmp_path, Autopilot("ardupilot"))
+    after = uptime - 300.0
+    talk.failover._file.written = Saved(booted=UTC - 300.0, after=after, computer="a")
+    talk.clocks = lambda: Clocks(UTC + off, uptime + off * (computer == "a"), computer)
+    assert talk.failover._is_same_boot(300.0) == same
 
 
 def test_an_imu_that_sends_nothing_is_not_called_slow(flying: Monitored) -> None:
