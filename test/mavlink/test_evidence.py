@@ -1067,6 +1067,33 @@ def test_an_old_name_counts_on_an_axis_on_which_the_others_agree(
     assert watched.blamed(2.0) == blamed
 
 
+def test_imus_are_trusted_after_two_seconds_of_agreement() -> None:
+    watched = Watched(3, STEP, 1000.0).run(1.8)
+    assert not any(map(watched.evidence._is_trusted, range(3)))
+    watched.run(0.6)
+    assert all(map(watched.evidence._is_trusted, range(3)))
+
+
+def test_an_axis_counts_as_judged_for_a_second() -> None:
+    watched = watch()
+    watched.states[1] = UNCHECKED
+    assert watched.run(0.9).step()[0].unjudged == ""
+    assert watched.run(0.3).step()[0].unjudged == "y"
+
+
+@pytest.mark.parametrize(("pause", "anew"), [(0.4, False), (0.6, True)])
+def test_states_begin_anew_after_a_pause_of_half_a_second(
+    pause: float, anew: bool
+) -> None:
+    watched = watch()
+    begun = watched.evidence.begun
+    watched.is_reporting = False
+    watched.run(pause)
+    watched.is_reporting = True
+    watched.step()
+    assert (watched.evidence.begun > begun) == anew
+
+
 def test_what_a_monitor_said_is_unknown_five_seconds_after_it_died() -> None:
     watched = watch()
     watched.states[0] = FAULTY
