@@ -195,7 +195,7 @@ def test_a_fault_that_comes_to_a_name_is_one_episode():
     (one,) = told(THREE, outputs(THREE, states, errors, time)).episodes
     assert one.words == (
         "imu_2.y FAULTY from 65.672 s (+0.0466 +- 0.0013 rad/s, growing to +0.304 rad/s); before that any"
-        " of the 9 channels from 63.072 s, imu_1.x or imu_2.y from 63.080 s"
+        " of the 9 gyros from 63.072 s, imu_1.x or imu_2.y from 63.080 s"
     )
     counts = [(step.state, len(step.channels)) for step in one.steps]
     assert counts == [("AMBIGUOUS", 9), ("AMBIGUOUS", 2), ("FAULTY", 1)]
