@@ -120,6 +120,16 @@ def test_the_odd_one_of_three_is_blamed_without_the_monitor(size: float) -> None
     assert watched.blamed(1.0) == {1}
 
 
+@pytest.mark.parametrize(("size", "blamed"), [(0.45, set()), (0.65, {1})])
+def test_half_a_rad_per_second_needs_no_doubt_of_the_monitor(
+    size: float, blamed: set[int]
+) -> None:
+    """Scales and the turn between two samples may add 0.1 rad/s to that."""
+    watched = watch()
+    watched.gyros[1] = biased(size)
+    assert watched.blamed(1.0) == blamed
+
+
 # Two that are wrong alike -----------------------------------------------------------------
 
 
