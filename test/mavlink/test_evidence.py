@@ -130,6 +130,14 @@ def test_half_a_rad_per_second_needs_no_doubt_of_the_monitor(
     assert watched.blamed(1.0) == blamed
 
 
+def test_the_odd_one_is_blamed_after_it_was_suspected_for_a_second() -> None:
+    watched = watch()
+    watched.gyros[1] = biased(0.25)
+    watched.states[3] = SUSPECT
+    assert watched.blamed(0.9) == set()
+    assert watched.blamed(0.4) == {1}
+
+
 # Two that are wrong alike -----------------------------------------------------------------
 
 
