@@ -1092,6 +1092,17 @@ def test_imus_are_trusted_after_two_seconds_of_agreement() -> None:
     assert all(map(watched.evidence._is_trusted, range(3)))
 
 
+@pytest.mark.parametrize(("rate", "trusted"), [(0.09, False), (0.11, True)])
+def test_imus_are_trusted_once_they_have_turned_by_a_tenth_of_a_rad_per_second(
+    rate: float, trusted: bool
+) -> None:
+    """A dead gyro agrees with one at rest."""
+    watched = Watched(3, STEP, 1000.0)
+    watched.rate = lambda t: np.array([rate, 0.0, 0.0])
+    watched.run(3.0)
+    assert all(map(watched.evidence._is_trusted, range(3))) == trusted
+
+
 def test_an_axis_counts_as_judged_for_a_second() -> None:
     watched = watch()
     watched.states[1] = UNCHECKED
