@@ -7,6 +7,7 @@ import copy
 import functools
 import math
 from collections.abc import Callable, Sequence
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -1101,6 +1102,20 @@ def test_imus_are_trusted_once_they_have_turned_by_a_tenth_of_a_rad_per_second(
     watched.rate = lambda t: np.array([rate, 0.0, 0.0])
     watched.run(3.0)
     assert all(map(watched.evidence._is_trusted, range(3))) == trusted
+
+
+@pytest.mark.parametrize(("change", "moves"), [(0.004, set()), (0.006, {0})])
+def test_an_axis_moves_whose_rate_changes_by_five_mrad_per_second(
+    change: float, moves: set[int]
+) -> None:
+    """Of gyros without noise. Five seconds later that is forgotten."""
+    watched = Watched(3, STEP, 1000.0)
+    watched.random = SimpleNamespace(normal=lambda *_: np.zeros(3))
+    watched.rate = lambda t: np.array([0.1 + change * (t > 2.0), 0.0, 0.0])
+    watched.run(6.5)
+    assert watched.evidence._tracks[0].moves == moves
+    watched.run(2.0)
+    assert watched.evidence._tracks[0].moves == set()
 
 
 def test_an_axis_counts_as_judged_for_a_second() -> None:
