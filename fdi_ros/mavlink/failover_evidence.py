@@ -39,9 +39,8 @@ from fdi_ros.mavlink.protocol import MS, NS, Vector
 DECAY = 0.5
 REFUTING = 300 * MS  #: Agreement refutes a doubt that has stood for this time, ns.
 BREAK = 100 * MS  #: A shorter break ends no agreement, and no difference, ns.
-SIZE_FORGOTTEN_NS = (
-    NS // 2
-)  #: Time of agreement after which an earlier size is forgotten, ns.
+#: Time of agreement after which an earlier size is forgotten, ns.
+SIZE_FORGOTTEN_NS = NS // 2
 #: A set must stand for this time to name an IMU, ns, and a name is for a difference that
 #: began at most this time after it.
 SET_STANDS = 300 * MS
