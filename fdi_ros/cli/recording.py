@@ -90,8 +90,13 @@ def _mount_findings(
     if start is None or start.mounted or one_clock(candidates(reports)):
         return
     if turned := turned_units(bag, Config.from_parameters(start.parameters)):
-        words = f"{turned}; a config of `fdi inspect` has them parallel, `fdi setup` measures the mounts"
-        yield Finding(Role.WARNING, "mounts", words, headline="READY, BUT LOOK")
+        yield Finding(
+            Role.WARNING,
+            "mounts",
+            turned,
+            headline="READY, BUT LOOK",
+            advice="use `fdi setup`, because `fdi inspect` does not measure mounts",
+        )
 
 
 def _starting_config(

@@ -660,7 +660,7 @@ def _rate(one: Episode, unit: Unit) -> str:
         before = (
             ""
             if rate.std_before_rad_s is None
-            else f" ({_figure(rate.std_before_rad_s, unit)} before)"
+            else f" ({_figure(rate.std_before_rad_s, unit)} before the fault)"
         )
         words.append(
             f"mean standard deviation {_figure(rate.std_rad_s, unit)} {unit.name}{before}"

@@ -1016,8 +1016,8 @@ def _sections(
     proof = found.proof
     result = found.calibration
     first = verdict_of(findings)
-    hint = f"Replays of {proof.source}: one unchanged, and others in which a bias begins on one channel,"
-    hint += f" at {TIMES} times. Isolated: that channel alone is declared within {WITHIN:g} s."
+    hint = f"Replays of {proof.source}: one has no fault. In each of the others a bias begins on one channel,"
+    hint += f" at one of {TIMES} moments. Isolated: that channel alone is declared within {WITHIN:g} s."
     bag = shlex.quote(bag)
     config = shlex.quote(config)
     is_bad = first.severity is Severity.BAD
