@@ -172,8 +172,10 @@ def test_a_unit_that_repeats_its_stamps_is_worth_a_look(tmp_path, fdi):
         " not used"
     )
     assert advice == (
-        f"check the driver of {TOPICS[1]}: every message needs the time of its measurement"
+        f"check the driver of {TOPICS[1]}: every message needs the time of its measurement;"
+        " use `fdi setup`, because `fdi inspect` does not measure mounts"
     )
+    assert " is turned by " in words
 
 
 @pytest.mark.parametrize("which", ["flight", "recording"])
