@@ -68,6 +68,11 @@ SHOWN = 2.0
 #: lost a part of their scale agree for 13 % of the time, now for 5 %. At 1.0 half of the
 #: healed ones stay out in a circle.
 SAME_TURN = 0.8
+#: Two have lost similar parts of their scales if these differ by this or less.
+ALIKE_SHARES = 0.2
+#: Largest such part. One that has lost more does not move, and a gyro with an error in a hover
+#: differs from all others by its whole rate.
+MOST_ALIKE = 0.85
 TINY = 1e-3  #: Resolution of the messages, rad/s.
 #: An axis moves if its mean rate and the one of another IMU change alike, by this or more, rad/s. A
 #: steady rate is no motion: both axes may be stuck at it.
@@ -135,10 +140,33 @@ class Wrong(NamedTuple):
     rate: float  #: Largest rate of the others about it then, rad/s.
     share: float  #: Largest ratio of error and rate: 1 for a gyro without scale.
 
+    def with_error(self, size: float, rate: float) -> Wrong:
+        """Return how it was bad, after an error of a size, rad/s, at a rate, rad/s."""
+        share = size / max(rate, TINY)
+        if self == WITHOUT_SCALE:
+            # That was no measurement.
+            return Wrong(rate, share)
+        return Wrong(max(rate, self.rate), max(share, self.share))
+
+    def shown_by(self, dead: float) -> float:
+        """Return the least turn that shows it, rad/s. dead: the same of a gyro without scale."""
+        return max(dead, min(SAME_TURN * self.rate, dead / self.share))
+
+    def explains(self, size: float, rate: float, min_size: float) -> bool:
+        """Return whether a loss of a similar part of the scale explains a difference.
+
+        size: of the difference, rad/s. rate: of a gyro with its whole scale, rad/s.
+        """
+        share = MOST_ALIKE if self == UNKNOWN else self.share + ALIKE_SHARES
+        return size < min(share, MOST_ALIKE) * rate + min_size
+
 
 WITHOUT_SCALE = Wrong(
     rate=math.inf, share=1.0
 )  #: A dead axis, or one of which no more is known.
+#: An axis of which an older file tells only that it was bad: the turn that shows it shows any
+#: loss of scale that healthy gyros do not have.
+UNKNOWN = Wrong(rate=math.inf, share=SCALE)
 UNCOMPARED = Compared(*[UNKNOWN_RATES] * 4)
 
 
@@ -516,7 +544,7 @@ class Evidence:
                 track.has_shown = True
             if self._together is not None and now - self._together >= TRUSTED:
                 is_old = now - track.doubted_at >= REFUTING
-                if track.has_shown:
+                if track.has_shown and not track.waits:
                     track.refuted = doubts if is_old else track.refuted or set()
                     track.off.clear()
             elif all(size >= self._min_size for size in own):
@@ -587,7 +615,7 @@ class Evidence:
             track.agreed = track.agreed or now
             # A mean that is no steady error yet may be the begin or end of a turn.
             alike = [k for k in agreeing if self._agree(unit, k, doubted=True)]
-            if any(self._shows_all(track, k) for k in alike):
+            if any(self._shows_all(unit, k) for k in alike):
                 track.turned = track.turned or now
         if unit in self._taken and track.waits:
             return None
@@ -611,9 +639,8 @@ class Evidence:
         for axis in off:
             # Of a gyro without scale the error is this rate at most.
             rate = max(self.raw.peaks(k)[axis] for k in partners.on[axis])
-            share = track.nearest[axis] / max(rate, TINY)
-            before = track.wrong.get(axis, Wrong(rate, share))
-            track.wrong[axis] = Wrong(max(rate, before.rate), max(share, before.share))
+            before = track.wrong.get(axis, WITHOUT_SCALE)
+            track.wrong[axis] = before.with_error(track.nearest[axis], rate)
         new = named - track.wrong.keys() or (set() if track.wrong else {0, 1, 2})
         track.wrong |= dict.fromkeys(new, WITHOUT_SCALE)
         if off or new:
@@ -621,26 +648,64 @@ class Evidence:
             track.turned = None
             track.shown.clear()
 
-    def _shows_all(self, track: Track, other: int) -> bool:
+    def _shows_all(self, unit: int, other: int) -> bool:
         """Return whether an IMU that agrees with another has done so in turns that show its errors.
 
         A bias was apart at rest too. A gyro that has lost its scale on one axis shows that
-        only in turns about this axis, and after any error a gyro may be dead.
+        only in turns about this axis, and after any error a gyro may be dead. Agreement with
+        one that may have failed alike shows nothing.
         """
+        track = self._tracks[unit]
         motion = self.raw.motion(other)
         turn = motion.mean
         dead = SHOWN * self._min_size
         # What scatters does not agree from `CALM` on: twice that is shown by a shake.
         shakes = [dead * shake / (2.0 * CALM) for shake in motion.std]
         for axis in range(3):
-            wrong = track.wrong.get(axis, WITHOUT_SCALE)
-            needed = max(dead, min(SAME_TURN * wrong.rate, dead / wrong.share))
-            if max(abs(turn[axis]), shakes[axis]) >= needed:
-                track.shown.add(axis)
+            needed = track.wrong.get(axis, WITHOUT_SCALE).shown_by(dead)
+            if max(abs(turn[axis]), shakes[axis]) < needed:
+                continue
+            if axis in track.wrong and not self._is_witness(other, unit, axis):
+                continue
+            track.shown.add(axis)
         faulty = track.axes(ChannelState.FAULTY)
         if track.wrong or faulty:
             return not track.waits and faulty <= track.shown
         return math.hypot(*turn) >= TURN_RATE
+
+    def _is_witness(self, unit: int, bad: int, axis: int) -> bool:
+        """Return whether agreement with an IMU shows that a bad one measures an axis again.
+
+        The monitor does not doubt it there, and no third IMU differs as if both had lost a
+        similar part of their scale.
+        """
+        if axis in self._tracks[unit].axes(*DOUBTS):
+            return False
+        wrong = self._tracks[bad].wrong[axis]
+        others = set(range(len(self._tracks))) - {unit, bad}
+        return not any(self._differs_by(wrong, k, unit, axis) for k in others)
+
+    def _differs_by(self, wrong: Wrong, unit: int, other: int, axis: int) -> bool:
+        """Return whether an IMU differs from another as if that one was wrong like this."""
+        pair = self._pairs.get((unit, other), UNCOMPARED)
+        size = pair.apart[axis]
+        rate = abs(self.raw.motion(unit).mean[axis])
+        return size >= self._min_size and wrong.explains(size, rate, self._min_size)
+
+    def _fail_alike(self, unit: int, axis: int) -> bool:
+        """Return whether the others may be wrong on an axis, and an IMU that differs be healthy.
+
+        One that was bad there, and has not shown more, agrees with one with which this one is
+        compared. They differ as if both had lost a similar part of their scale.
+        """
+        return any(
+            axis in track.waits
+            and self._pairs.get((k, other), UNCOMPARED).apart[axis] < self._min_size
+            and self._differs_by(track.wrong[axis], unit, other, axis)
+            for k, track in enumerate(self._tracks)
+            for other in self._tracks[unit].partners.on[axis] - {k}
+            if k != unit
+        )
 
     def _partners(
         self, unit: int, units: Sequence[int], out: Sequence[int]
@@ -686,7 +751,8 @@ class Evidence:
         If two others outvote it, its name may be for an earlier error. Otherwise it may be the
         others that are wrong, or each by less than ``min_size``: its name must have come with this
         difference, which is `VOTE` times as large, and the monitor must not doubt that axis of
-        those that it is compared with. One of these must move. While all others are out of use,
+        those that it is compared with. One of these must move, and may not have failed like one
+        that is known to be bad. While all others are out of use,
         all that counts is whether the last one is better.
         """
         track = self._tracks[unit]
@@ -700,6 +766,8 @@ class Evidence:
                 is_doubted = any(axis in other.axes(*DOUBTS) for other in others)
                 moves = any(axis in other.moves for other in others)
                 if is_doubted or not moves or not track.is_new(axis):
+                    continue
+                if self._fail_alike(unit, axis):
                     continue
             if track.nearest[axis] >= least:
                 blamed.add(axis)
