@@ -118,7 +118,7 @@ class Failover:
         saved = self._file.written
         self._system = saved.system
         self._state = PolicyState.begin(count, saved.out, saved.without_notch)
-        self.evidence.remember(dict(zip(saved.out, saved.axes, strict=False)))
+        self.evidence.remember(dict(zip(saved.out, saved.bad, strict=False)))
         self._words = WordsState((Note(),) * count)
         self._values: list[tuple[bool | None, int]] = [(None, 0)] * count
         self._lanes: int | None = None  # of `EKF_LANES`. None: not reported
@@ -229,7 +229,7 @@ class Failover:
             after=clocks.uptime - ago,
             computer=clocks.boot,
             without_notch=self._without_notch,
-            axes=tuple(map(self.evidence.bad_axes, self.out)),
+            bad=tuple(map(self.evidence.bad, self.out)),
         )
 
     def restore(self, now: int) -> tuple[bool, str]:

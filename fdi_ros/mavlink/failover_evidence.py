@@ -73,6 +73,7 @@ ALIKE_SHARES = 0.2
 #: Largest such part. One that has lost more does not move, and a gyro with an error in a hover
 #: differs from all others by its whole rate.
 MOST_ALIKE = 0.85
+STEP = 1.25  #: Ratio of two steps in which the file keeps how an IMU was bad.
 TINY = 1e-3  #: Resolution of the messages, rad/s.
 #: An axis moves if its mean rate and the one of another IMU change alike, by this or more, rad/s. A
 #: steady rate is no motion: both axes may be stuck at it.
@@ -148,6 +149,18 @@ class Wrong(NamedTuple):
             return Wrong(rate, share)
         return Wrong(max(rate, self.rate), max(share, self.share))
 
+    def in_steps(self) -> Wrong:
+        """Return it with at least this rate and at most this share, in steps of `STEP`.
+
+        So a turn that shows this shows also what it was, and small changes are none.
+        """
+        if self in (WITHOUT_SCALE, UNKNOWN):
+            return self
+        rate, share = (math.log(max(value, TINY), STEP) for value in self)
+        # One that is a step already stays one.
+        rate = STEP ** math.ceil(rate - TINY) if math.isfinite(rate) else rate
+        return Wrong(rate, STEP ** math.floor(share + TINY))
+
     def shown_by(self, dead: float) -> float:
         """Return the least turn that shows it, rad/s. dead: the same of a gyro without scale."""
         return max(dead, min(SAME_TURN * self.rate, dead / self.share))
@@ -157,6 +170,9 @@ class Wrong(NamedTuple):
 
         size: of the difference, rad/s. rate: of a gyro with its whole scale, rad/s.
         """
+        if self.share > 1.0 + ALIKE_SHARES:
+            # An error at rest, too.
+            return False
         share = MOST_ALIKE if self == UNKNOWN else self.share + ALIKE_SHARES
         return size < min(share, MOST_ALIKE) * rate + min_size
 
@@ -322,17 +338,17 @@ class Evidence:
         self._turns: dict[int, Vector] = {}  # mean rates at some time, rad/s
         self._turned_at = 0  # that time, ns
 
-    def remember(self, axes: Mapping[int, str]) -> None:
-        """Take the axes on which IMUs were bad before a restart, such as xy.
+    def remember(self, bad: Mapping[int, Mapping[str, Wrong]]) -> None:
+        """Take how IMUs were bad before a restart, by axis."""
+        for k, axes in bad.items():
+            track = self._tracks[k]
+            track.wrong = {AXES.index(name): wrong for name, wrong in axes.items()}
+            track.off = set(track.wrong)
 
-        How they were bad is not known any more: each counts as without scale.
-        """
-        for k, names in axes.items():
-            self._tracks[k].wrong = dict.fromkeys(map(AXES.index, names), WITHOUT_SCALE)
-
-    def bad_axes(self, unit: int) -> str:
-        """Return the axes on which an IMU is or was bad, such as xy."""
-        return "".join(AXES[axis] for axis in sorted(self._tracks[unit].wrong))
+    def bad(self, unit: int) -> dict[str, Wrong]:
+        """Return how an IMU is or was bad, by axis, in steps that a file can keep."""
+        wrong = sorted(self._tracks[unit].wrong.items())
+        return {AXES[axis]: one.in_steps() for axis, one in wrong}
 
     def hear(self, states: Sequence[float], now: int) -> None:
         """Take the states of all channels, numbers of `ChannelState`, at time now, ns."""
@@ -686,21 +702,25 @@ class Evidence:
         return not any(self._differs_by(wrong, k, unit, axis) for k in others)
 
     def _differs_by(self, wrong: Wrong, unit: int, other: int, axis: int) -> bool:
-        """Return whether an IMU differs from another as if that one was wrong like this."""
-        pair = self._pairs.get((unit, other), UNCOMPARED)
-        size = pair.apart[axis]
+        """Return whether an IMU differs from another as if that one was wrong like this.
+
+        As a turn begins, the difference is not steady yet.
+        """
+        size = self._pairs.get((unit, other), UNCOMPARED).mean[axis]
         rate = abs(self.raw.motion(unit).mean[axis])
         return size >= self._min_size and wrong.explains(size, rate, self._min_size)
 
     def _fail_alike(self, unit: int, axis: int) -> bool:
         """Return whether the others may be wrong on an axis, and an IMU that differs be healthy.
 
-        One that was bad there, and has not shown more, agrees with one with which this one is
+        One that was bad there, and has not shown more, is near one with which this one is
         compared. They differ as if both had lost a similar part of their scale.
         """
+        rate = abs(self.raw.motion(unit).mean[axis])
         return any(
             axis in track.waits
-            and self._pairs.get((k, other), UNCOMPARED).apart[axis] < self._min_size
+            and self._pairs.get((k, other), UNCOMPARED).mean[axis]
+            < ALIKE_SHARES * rate + self._min_size
             and self._differs_by(track.wrong[axis], unit, other, axis)
             for k, track in enumerate(self._tracks)
             for other in self._tracks[unit].partners.on[axis] - {k}

@@ -6,9 +6,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fdi_ros.mavlink.failover_evidence import UNKNOWN, Wrong
 from fdi_ros.mavlink.kept_file import KeptFile
 
 
@@ -23,12 +25,33 @@ class Saved(NamedTuple):
     computer: str = ""  #: Identity of that start of this computer. Empty: unknown.
     #: IMUs, out of use or not, that were out when the autopilot started.
     without_notch: tuple[int, ...] = ()
-    axes: tuple[str, ...] = ()  #: Axes on which each IMU of `out` was bad, such as xy.
+    bad: tuple[
+        Mapping[str, Wrong], ...
+    ] = ()  #: How each IMU of `out` was bad, by axis.
 
     @property
     def lasting(self) -> tuple[object, ...]:
         """What does not change from tick to tick."""
-        return self.system, self.out, self.without_notch, self.axes
+        return self.system, self.out, self.without_notch, self.bad
+
+
+def _wrong(numbers: Any) -> Wrong:
+    """Return how an axis was bad, of what `_numbers` made of it."""
+    if numbers is None:
+        return UNKNOWN
+    rate, share = numbers
+    wrong = Wrong(math.inf if rate is None else float(rate), float(share))
+    if not (wrong.rate > 0.0 and 0.0 < wrong.share < math.inf):
+        raise ValueError
+    return wrong
+
+
+def _numbers(wrong: Wrong) -> list[float | None] | None:
+    """Return rate and share as JSON has them: an infinite rate is null, and so is `UNKNOWN`."""
+    if wrong == UNKNOWN:
+        return None
+    rate = wrong.rate if math.isfinite(wrong.rate) else None
+    return [rate, wrong.share]
 
 
 class FailoverFile(KeptFile[Saved]):
@@ -54,6 +77,11 @@ class FailoverFile(KeptFile[Saved]):
             raise ValueError
         if len(axes) != len(out) or not set("".join(axes)) <= set("xyz"):
             raise ValueError
+        # Older files tell no more than the axes.
+        errors = found.get("bad_errors", [dict.fromkeys(names) for names in axes])
+        bad = tuple({axis: _wrong(one) for axis, one in by.items()} for by in errors)
+        if list(map(set, bad)) != list(map(set, axes)):
+            raise ValueError
         return Saved(
             system=int(found["system_id"]),
             out=out,
@@ -61,7 +89,7 @@ class FailoverFile(KeptFile[Saved]):
             after=float(found.get("after_computer", math.nan)),
             computer=str(found.get("computer_boot", "")),
             without_notch=bare,
-            axes=axes,
+            bad=bad,
         )
 
     def encode(self, content: Saved) -> dict[str, Any]:
@@ -71,7 +99,11 @@ class FailoverFile(KeptFile[Saved]):
             "out_of_use": [imu + 1 for imu in content.out],
             "autopilot_booted": round(content.booted, 1),
             "without_notch": [imu + 1 for imu in content.without_notch],
-            "bad_axes": list(content.axes),
+            "bad_axes": ["".join(by) for by in content.bad],
+            "bad_errors": [
+                {axis: _numbers(wrong) for axis, wrong in by.items()}
+                for by in content.bad
+            ],
         }
         if content.computer:
             found["after_computer"] = round(content.after, 1)

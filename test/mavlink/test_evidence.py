@@ -6,14 +6,14 @@
 import copy
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.mavlink.failover_evidence import Evidence
+from fdi_ros.mavlink.failover_evidence import UNKNOWN, WITHOUT_SCALE, Evidence, Wrong
 from fdi_ros.mavlink.failover_policy import Imu, PolicySettings, is_reserve
 from fdi_ros.mavlink.failover_raw import RawComparison, Rows
 from mavlink.watched_flights import WatchedFlight
@@ -802,6 +802,178 @@ def test_an_imu_agrees_only_after_a_turn_about_each_axis_that_was_bad(
     imu = watched.run(2.0).step()[0]
     assert imu.agreed is not None
     assert not imu.waits
+
+
+def scaled(share: float) -> Gyro:
+    """Return a gyro that measures a share of the rate about y."""
+    return lambda rate: rate * np.array([1.0, share, 1.0])
+
+
+def turning_fast(t: float) -> np.ndarray:
+    """Return the rate of a vehicle that turns to and fro about y by up to 1.2 rad/s."""
+    return 2.4 * turning_about(1)(t)
+
+
+def without_scale(share: float = 0.5) -> Watched:
+    """Return a flight in which IMU 0 keeps a share of its scale about y, goes out, and hovers."""
+    watched = watch()
+    watched.rate = turning_fast
+    watched.gyros[0] = scaled(share)
+    watched.states[1] = FAULTY
+    assert watched.blamed(1.0) == {0}
+    watched.out = [0]
+    watched.run(2.0).rate = hovering
+    return watched.run(1.0)
+
+
+@pytest.mark.parametrize("share", [0.44, 0.5, 0.6])
+def test_one_without_scale_shows_nothing_by_agreeing_with_one_that_fails_alike(
+    share: float,
+) -> None:
+    """The monitor names the healthy one instead: in a hover before, so that it stays in use."""
+    watched = without_scale()
+    watched.gyros[1] = scaled(share)
+    watched.states = [OK] * 7 + [FAULTY, OK]
+    watched.run(1.0).rate = turning_fast
+    waits = {watched.step()[0].waits for _ in range(400)}
+    assert waits == {"y"}
+    # Nor do two seconds of hover give it its vote.
+    watched.states = [OK] * 9
+    watched.rate = hovering
+    watched.run(3.0).rate = turning_fast
+    watched.states[7] = SUSPECT
+    assert watched.blamed(4.0) == set()
+
+
+@pytest.mark.parametrize("third", [biased(0.5, axis=1), zero, scaled(-1.0)])
+def test_one_that_has_healed_shows_that_beside_a_third_that_differs_otherwise(
+    third: Gyro,
+) -> None:
+    watched = without_scale()
+    watched.gyros[0] = sound
+    watched.gyros[2] = third
+    watched.states = [OK] * 7 + [FAULTY, OK]
+    watched.out = [0, 2]
+    watched.run(1.0).rate = turning_fast
+    imu = watched.run(4.0).step()[0]
+    assert not imu.waits
+    assert imu.agreed is not None
+
+
+def test_agreement_with_an_axis_that_the_monitor_doubts_shows_nothing() -> None:
+    watched = without_scale()
+    watched.gyros[0] = sound
+    watched.states = [OK] * 9
+    watched.states[4] = watched.states[7] = AMBIGUOUS
+    watched.rate = turning_fast
+    assert {watched.step()[0].waits for _ in range(200)} == {"y"}
+    watched.states[7] = OK
+    assert not watched.run(1.0).step()[0].waits
+
+
+def test_one_that_has_failed_again_is_not_trusted_for_a_turn_from_before() -> None:
+    """It heals for half a second in a turn, and fails again, together with a second one."""
+    watched = without_scale()
+    watched.rate = turning_fast
+    watched.run(1.0).gyros[0] = sound
+    watched.states = [OK] * 9
+    assert not watched.run(0.5).step()[0].waits
+    watched.gyros[:2] = [scaled(0.5)] * 2
+    watched.run(2.0).rate = hovering
+    assert watched.run(3.0).step()[0].waits == "y"
+    watched.rate = turning_fast
+    assert watched.blamed(3.0) == set()
+
+
+def test_one_that_has_healed_and_turned_has_its_vote_again() -> None:
+    watched = without_scale()
+    watched.gyros[0] = sound
+    watched.states = [OK] * 9
+    watched.rate = turning_fast
+    watched.run(4.0).gyros[2] = biased(0.8, axis=1)
+    assert watched.blamed(0.5) == {2}
+
+
+def test_a_new_name_does_not_blame_the_one_from_which_two_differ_alike() -> None:
+    """The second one loses scale as the first one did; the monitor names the healthy third."""
+    watched = without_scale()
+    watched.states = [OK] * 9
+    watched.gyros[1] = scaled(0.4)
+    watched.run(1.0).rate = turning_fast
+    watched.states[7] = FAULTY
+    assert watched.blamed(4.0) == set()
+
+
+@pytest.mark.parametrize("size", [0.15, 0.5])
+def test_a_new_name_blames_one_that_differs_otherwise_beside_one_that_waits(
+    size: float,
+) -> None:
+    """The first one has healed in a hover and waits for a turn."""
+    watched = without_scale()
+    watched.gyros[0] = sound
+    watched.states = [OK] * 9
+    watched.rate = lambda t: 0.03 * np.sin([2.1 * t, 1.7 * t, t])
+    assert watched.run(2.0).step()[0].waits == "y"
+    watched.gyros[2] = biased(size, axis=1)
+    watched.states[7] = FAULTY
+    assert watched.blamed(2.0) == {2}
+
+
+def anew(watched: Watched, bad: Mapping[str, Wrong] | None = None) -> Watched:
+    """Start the node anew, with what it knew of IMU 0, or with something else."""
+    known = watched.evidence.bad(0) if bad is None else bad
+    watched.evidence = Evidence(3, watched.interval, min_size=0.03)
+    watched.evidence.remember({0: known})
+    return watched
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize(("factor", "waits"), [(0.7, "y"), (1.6, "")])
+def test_a_turn_shows_a_lost_scale_after_a_restart_as_before(
+    share: float, factor: float, waits: str
+) -> None:
+    """One that has lost a fifth differs by 0.03 rad/s from one that turns by 0.15."""
+    watched = without_scale(share)
+    needed = 0.06 / (1.0 - share)
+    for flight in (copy.deepcopy(watched), anew(watched)):
+        flight.gyros[0] = sound
+        flight.rate = lambda t: 2.0 * factor * needed * turning_about(1)(t)
+        assert flight.run(4.0).step()[0].waits == waits
+
+
+@pytest.mark.parametrize(("rate", "waits"), [(1.1, "y"), (1.4, "")])
+def test_of_an_axis_of_unknown_error_a_turn_shows_any_loss_of_scale(
+    rate: float, waits: str
+) -> None:
+    watched = anew(without_scale(), {"y": UNKNOWN})
+    watched.gyros[0] = sound
+    watched.rate = lambda t: 2.0 * rate * turning_about(1)(t)
+    assert watched.run(4.0).step()[0].waits == waits
+
+
+def test_after_a_restart_one_that_waits_has_no_vote() -> None:
+    """A second gyro loses as much of its scale. All agree in a hover, before and after it."""
+    watched = without_scale()
+    watched.gyros[1] = scaled(0.5)
+    watched = anew(watched)
+    watched.states = [OK] * 9
+    watched.run(6.0).rate = turning_fast
+    watched.states[7] = SUSPECT
+    assert watched.blamed(4.0) == set()
+
+
+@pytest.mark.parametrize("rate", [0.013, 0.4, 1.25, 30.0, math.inf])
+@pytest.mark.parametrize("share", [0.03, 0.2, 1.0, 40.0])
+def test_what_a_file_keeps_of_an_error_is_shown_by_a_turn_that_shows_it(
+    rate: float, share: float
+) -> None:
+    wrong = Wrong(rate, share)
+    kept = wrong.in_steps()
+    assert wrong.rate <= kept.rate <= 1.26 * rate
+    assert share / 1.26 <= kept.share <= share * 1.001
+    assert kept.in_steps() == pytest.approx(kept)
+    for exact in (UNKNOWN, WITHOUT_SCALE):
+        assert exact.in_steps() == exact
 
 
 def test_an_imu_that_is_out_without_a_known_axis_waits_for_turns_about_all() -> None:

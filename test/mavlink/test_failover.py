@@ -922,6 +922,39 @@ def test_a_restart_of_the_companion_forgets_no_axis(
     assert again.run(8.0).in_use == [True] * 3
 
 
+@pytest.mark.parametrize("errors", ["kept", "of an older file"])
+def test_a_restart_of_the_companion_does_not_heal_a_gyro_that_lost_some_scale(
+    moving: Moving, tmp_path: Path, errors: str
+) -> None:
+    """IMU 1 has lost a quarter about y: in a turn of 0.1 rad/s it differs by 0.025 rad/s.
+
+    An older file has no more than the axes: it takes a turn that shows any loss.
+    """
+    talk, moved = moving(0.1, 0.8, 0.1)
+    moved.scale[0, 1] = 0.75
+    talk.fault(1, 0.0, seconds=2.0)
+    assert talk.in_use == [False, True, True]
+    moved.rate = np.array([0.01, 0.1, 0.02])
+    talk.heal(1, 6.0)
+    assert talk.in_use == [False, True, True]
+    talk.failover.close()
+    file = tmp_path / "out.json"
+    content = json.loads(file.read_text())
+    rate, share = content["bad_errors"][0]["y"]
+    assert 0.8 < rate < 1.5
+    assert 0.15 < share < 0.27
+    if errors != "kept":
+        del content["bad_errors"]
+        file.write_text(json.dumps(content))
+    again = restarted(talk, tmp_path).run(6.0)
+    assert again.in_use == [False, True, True]
+    moved.scale[:] = 1.0
+    moved.rate = np.array([0.01, 0.7, 0.02])
+    assert again.run(6.0).in_use == [errors == "kept", True, True]
+    moved.rate = np.array([0.01, 1.4, 0.02])
+    assert again.run(6.0).in_use == [True, True, True]
+
+
 def test_two_gyros_that_die_in_a_hover_do_not_outvote_the_third(
     moving: Moving,
 ) -> None:
@@ -1666,6 +1699,20 @@ def test_a_file_that_cannot_be_written_in_flight_is_announced_and_written_later(
         '{"system_id": 1, "out_of_use": [4]}',
         '{"system_id": 1, "out_of_use": [2], "bad_axes": ["w"]}',
         '{"system_id": 1, "out_of_use": [2], "bad_axes": []}',
+        '{"system_id": 1, "out_of_use": [2], "bad_axes": ["y"], "bad_errors": []}',
+        *[
+            '{"system_id": 1, "out_of_use": [2], "bad_axes": ["y"], '
+            f'"bad_errors": [{{"{axis}": {error}}}]}}'
+            for axis, error in (
+                ("z", [0.5, 0.4]),
+                ("y", []),
+                ("y", 0.4),
+                ("y", [0.5]),
+                ("y", [0.5, 0.0]),
+                ("y", [-0.5, 0.4]),
+                ("y", "[NaN, 0.4]"),
+            )
+        ],
         '{"system_id": Infinity, "out_of_use": []}',
         '{"system_id": 1, "out_of_use": [Infinity]}',
         "[" * 4000,
