@@ -11,7 +11,8 @@ they outvote the third on an axis only if both have moved of late (`MOVED_BY_RAD
 is trusted (`TRUSTED`) or has moved since it was found bad on another axis, and if the monitor
 has no doubt about them that it does not have about the third as well. Two that were both taken
 out in this flight outvote one that was not only once one of them is back, and has
-agreed in turns about all axes.
+agreed in turns about all axes. An IMU that was bad proves nothing by agreeing with one that may
+have lost a similar part of its scale (`Evidence._is_witness`).
 """
 
 from __future__ import annotations

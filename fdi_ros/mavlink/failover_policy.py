@@ -22,15 +22,16 @@ Definitions
              a. outvoted: two others agree on that axis. Each is trusted and moves, or proven,
                 and the monitor does not doubt them
              b. the name came with this difference: it is at most 0.3 s older than twice
-                ``min_size``. The monitor doubts that axis of no IMU that counts there, and
-                one of these moves
+                ``min_size``. The monitor doubts that axis of no IMU that counts there,
+                one of these moves, and none may have failed like one that is known to be bad
     bad      blamed, and delivers. Else left in use.
     alive    delivers samples, and they change while other IMUs turn
     OK       by the monitor on all axes, which has doubted none since the IMU is apart there
     sound    alive, and OK or not apart
     reserve  for a bad IMU: sound. Or alive, OK on the axis on which the bad one is off most, and
              unchecked on others only because all other IMUs are FAULTY there
-    trusted  all IMUs have agreed for 2 s since it was last apart. A bad one in use prevents that
+    trusted  all IMUs have agreed for 2 s since it was last apart, and in turns that show how it
+             was bad. A bad one in use prevents that
     ours     out of use by our order, or perhaps so: from the moment the order is sent
              until the autopilot reports "in use" `SETTLED` after it
     seen     INS_USE as reported. A change that we have not ordered counts once it has

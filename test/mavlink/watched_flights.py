@@ -4,10 +4,11 @@
 """Random flights of failover with its evidence: `cd test && python -m mavlink.watched_flights 200`,
 or some of them: `python -m mavlink.watched_flights 400 600`.
 
-Three gyros measure a random motion, and fail at random. The monitor judges what they send;
-`Evidence` and the policy judge both, and the vehicle obeys at once. Every order, and every
-moment without one, is checked against the true errors of the gyros. `mavlink.flights` has the
-link, the autopilot and other stations.
+Three gyros measure a random motion, and fail at random. In every second flight two of them lose
+similar parts of their scale in turn. In the last two of four, the node is started anew. The
+monitor judges what the gyros send; `Evidence` and the policy judge both, and the vehicle obeys
+at once. Every order, and every moment without one, is checked against the true errors of the
+gyros. `mavlink.flights` has the link, the autopilot and other stations.
 """
 
 from collections import Counter
@@ -89,6 +90,17 @@ def fail(random: np.random.Generator, t: np.ndarray, rates: np.ndarray) -> np.nd
     return failed
 
 
+def lose_scale(random: np.random.Generator, t: np.ndarray, gyros: np.ndarray) -> None:
+    """Let two gyros lose similar parts of their scale on one axis, one some seconds after the other."""
+    first, second = random.permutation(3)[:2]
+    axis = random.integers(3)
+    begin = random.uniform(ARMED_AT + 3.0, ARMED_AT + 7.0)
+    share = random.uniform(0.4, 0.8)
+    gyros[t >= begin, first, axis] *= share
+    begin += random.uniform(3.0, 8.0)
+    gyros[t >= begin, second, axis] *= share + random.uniform(-0.1, 0.1)
+
+
 def averaged(values: np.ndarray) -> np.ndarray:
     """Return the mean of the last `AVERAGED` values at each time."""
     sums = np.cumsum(np.insert(values, 0, 0.0, axis=0), axis=0)
@@ -98,14 +110,26 @@ def averaged(values: np.ndarray) -> np.ndarray:
 
 
 class WatchedFlight:
-    """One flight: the samples, the true errors, and the checks."""
+    """One flight: the samples, the true errors, and the checks.
 
-    def __init__(self, seed: int, seconds: float = 60.0) -> None:
+    are_similar: two gyros lose similar parts of their scale, instead of random faults. is_anew: the
+    node is started anew in flight.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        seconds: float = 60.0,
+        are_similar: bool = False,
+        is_anew: bool = False,
+    ) -> None:
         self.random = random = np.random.default_rng(seed)
         self.t = t = np.arange(0.0, seconds, INTERVAL / NS)
         truth = motion(random, t)
         gyros = np.repeat(truth[:, None], 3, axis=1)
-        for _ in range(random.integers(1, 5)):
+        if are_similar:
+            lose_scale(random, t, gyros)
+        for _ in range(0 if are_similar else random.integers(1, 5)):
             k = random.integers(3)
             gyros[:, k] = fail(random, t, gyros[:, k])
         #: Size of the mean error of each IMU, rad/s.
@@ -122,6 +146,8 @@ class WatchedFlight:
         self.late = int(
             random.integers(1, 10)
         )  # age of the monitor's states, in samples
+        #: Sample at which the node is started anew.
+        self.anew_at = random.integers(len(t) // 3, len(t)) if is_anew else len(t)
         self.use = [True] * 3
         self.evidence = Evidence(3, INTERVAL, SETTINGS.min_size)
         self.state = PolicyState.begin(3)
@@ -137,6 +163,15 @@ class WatchedFlight:
         )
         states: np.ndarray = output.state[:, :9]
         return states
+
+    def start_anew(self) -> None:
+        """Start the node anew. It knows what its file has."""
+        memories = self.state.memories
+        out = [k for k, memory in enumerate(memories) if memory.ours]
+        bad = {k: self.evidence.bad(k) for k in out}
+        self.evidence = Evidence(3, INTERVAL, SETTINGS.min_size)
+        self.evidence.remember(bad)
+        self.state = PolicyState.begin(3, out)
 
     def turn(self, i: int) -> None:
         """Let failover look and act at sample i."""
@@ -202,6 +237,8 @@ class WatchedFlight:
     def fly(self) -> Counter[str]:
         """Fly, and return what was done."""
         for i, stamp in enumerate(self.stamps.tolist()):
+            if i == self.anew_at:
+                self.start_anew()
             for k, (x, y, z) in enumerate(self.values[i].tolist()):
                 self.evidence.raw.feed(k, stamp, (x, y, z))
             if not i % TURN:
@@ -209,5 +246,10 @@ class WatchedFlight:
         return self.done
 
 
+def begin(seed: int) -> WatchedFlight:
+    """Return a flight of the kind that belongs to its number."""
+    return WatchedFlight(seed, are_similar=seed % 2 == 1, is_anew=seed % 4 >= 2)
+
+
 if __name__ == "__main__":
-    fly_all(WatchedFlight)
+    fly_all(begin)
