@@ -16,7 +16,7 @@ from fdi_ros.core.states import ChannelState
 from fdi_ros.mavlink.failover_evidence import UNKNOWN, WITHOUT_SCALE, Evidence, Wrong
 from fdi_ros.mavlink.failover_policy import Imu, PolicySettings, is_reserve
 from fdi_ros.mavlink.failover_raw import RawComparison, Rows
-from mavlink.watched_flights import WatchedFlight
+from mavlink.watched_flights import WatchedFlight, begin
 
 MS = 1_000_000
 NS = 1000 * MS
@@ -962,6 +962,21 @@ def test_after_a_restart_one_that_waits_has_no_vote() -> None:
     assert watched.blamed(4.0) == set()
 
 
+@pytest.mark.parametrize(
+    ("share", "least", "most"),
+    [(0.1, 0.30, 0.36), (0.4, 0.60, 0.66), (0.8, 0.85, 0.91), (1.1, 0.85, 0.91)],
+)
+def test_a_loss_explains_differences_by_a_share_and_two_tenths_more(
+    share: float, least: float, most: float
+) -> None:
+    """At 1 rad/s, with errors of 0.03 rad/s at rest."""
+    wrong = Wrong(1.0, share)
+    assert wrong.explains(least, 1.0, 0.03)
+    assert not wrong.explains(most, 1.0, 0.03)
+    assert not Wrong(1.0, 1.5).explains(0.1, 1.0, 0.03), "an error at rest"
+    assert UNKNOWN.explains(0.85, 1.0, 0.03), "it may have lost any share"
+
+
 @pytest.mark.parametrize("rate", [0.013, 0.4, 1.25, 30.0, math.inf])
 @pytest.mark.parametrize("share", [0.03, 0.2, 1.0, 40.0])
 def test_what_a_file_keeps_of_an_error_is_shown_by_a_turn_that_shows_it(
@@ -1401,6 +1416,12 @@ def test_a_random_flight_is_right_by_the_true_errors(seed: int) -> None:
     """`python -m mavlink.watched_flights 200` flies more."""
     done = WatchedFlight(seed).fly()
     assert done["out of use"] >= 1
+
+
+@pytest.mark.parametrize("seed", [41003, 41039])
+def test_two_that_lose_scale_alike_never_take_the_third_out(seed: int) -> None:
+    """The node is started anew in these flights, in which the healthy IMU once went out."""
+    assert begin(seed).fly()["out of use"] == 1
 
 
 def test_an_imu_is_not_blamed_for_the_error_of_another_that_has_healed() -> None:
