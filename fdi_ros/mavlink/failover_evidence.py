@@ -71,9 +71,11 @@ SHOWN = 2.0
 SAME_TURN = 0.8
 #: Two have lost similar parts of their scales if these differ by this or less.
 ALIKE_SHARES = 0.2
-#: Largest such part. One that has lost more does not move, and a gyro with an error in a hover
+#: Largest such part that is lost. One that has lost more does not move, and a gyro with an error in a hover
 #: differs from all others by its whole rate.
 MOST_ALIKE = 0.85
+#: A larger share was no error of scale, but one at rest, too.
+MOST_SHARE = 1.2
 STEP = 1.25  #: Ratio of two steps in which the file keeps how an IMU was bad.
 TINY = 1e-3  #: Resolution of the messages, rad/s.
 #: An axis moves if its mean rate and the one of another IMU change alike, by this or more, rad/s. A
@@ -142,6 +144,11 @@ class Wrong(NamedTuple):
     rate: float  #: Largest rate of the others about it then, rad/s.
     share: float  #: Largest ratio of error and rate: 1 for a gyro without scale.
 
+    @property
+    def is_of_scale(self) -> bool:
+        """Whether it may have been an error of scale."""
+        return self.share <= MOST_SHARE
+
     def with_error(self, size: float, rate: float) -> Wrong:
         """Return how it was bad, after an error of a size, rad/s, at a rate, rad/s."""
         share = size / max(rate, TINY)
@@ -166,16 +173,20 @@ class Wrong(NamedTuple):
         """Return the least turn that shows it, rad/s. dead: the same of a gyro without scale."""
         return max(dead, min(SAME_TURN * self.rate, dead / self.share))
 
-    def explains(self, size: float, rate: float, min_size: float) -> bool:
-        """Return whether a loss of a similar part of the scale explains a difference.
+    def explains(self, rate: float, other: float, min_size: float) -> bool:
+        """Return whether another rate, rad/s, is that of a gyro with a similar error of scale.
 
-        size: of the difference, rad/s. rate: of a gyro with its whole scale, rad/s.
+        rate: that of a gyro with the right scale. It differs from the other one.
         """
-        if self.share > 1.0 + ALIKE_SHARES:
-            # An error at rest, too.
+        size = abs(other - rate)
+        is_more = abs(other) > abs(rate)
+        share = self.share + ALIKE_SHARES
+        if self == UNKNOWN:
+            share = MOST_SHARE if is_more else MOST_ALIKE
+        elif not self.is_of_scale:
             return False
-        share = MOST_ALIKE if self == UNKNOWN else self.share + ALIKE_SHARES
-        return size < min(share, MOST_ALIKE) * rate + min_size
+        most = share if is_more else min(share, MOST_ALIKE)
+        return size < most * abs(rate) + min_size
 
 
 WITHOUT_SCALE = Wrong(
@@ -327,6 +338,7 @@ class Evidence:
         # The smallest steady difference of each at the last look, rad/s.
         self._steady: dict[tuple[int, int], Vector] = {}
         self._tracks = [Track() for _ in range(count)]
+        self._delivering: set[int] = set()  # IMUs that send samples
         self._taken: set[int] = set()  # IMUs taken out in this flight
         self._once_bad: set[int] = set()  # those of them without a vote
         self._min_size = min_size
@@ -390,6 +402,7 @@ class Evidence:
             for track in self._tracks:
                 track.states = ()
         units = [k for k, does in enumerate(delivers) if does]
+        self._delivering = set(units)
         self.raw.leave_out(out)
         self._taken = {*out, *taken}
         # One that is back regains its vote by turns about all axes: dead, it had not agreed.
@@ -693,23 +706,31 @@ class Evidence:
     def _is_witness(self, unit: int, bad: int, axis: int) -> bool:
         """Return whether agreement with an IMU shows that a bad one measures an axis again.
 
-        The monitor does not doubt it there, and no third IMU differs as if both had lost a
-        similar part of their scale.
+        Not if a third IMU differs as if both had a similar error of scale, nor if a third one
+        differs otherwise, the monitor doubts this one, and the bad one had an error of scale.
         """
-        if axis in self._tracks[unit].axes(*DOUBTS):
-            return False
         wrong = self._tracks[bad].wrong[axis]
-        others = set(range(len(self._tracks))) - {unit, bad}
-        return not any(self._differs_by(wrong, k, unit, axis) for k in others)
+        is_doubted = axis in self._tracks[unit].axes(*DOUBTS) and wrong.is_of_scale
+        others = self._delivering - {unit, bad}
+        return not any(
+            self._differs_by(None if is_doubted else wrong, k, unit, axis)
+            for k in others
+        )
 
-    def _differs_by(self, wrong: Wrong, unit: int, other: int, axis: int) -> bool:
+    def _differs_by(
+        self, wrong: Wrong | None, unit: int, other: int, axis: int
+    ) -> bool:
         """Return whether an IMU differs from another as if that one was wrong like this.
 
-        As a turn begins, the difference is not steady yet.
+        None: in any way. A delay may explain the difference as well: as a turn begins, that is
+        not known yet.
         """
-        size = self._pairs.get((unit, other), UNCOMPARED).mean[axis]
-        rate = abs(self.raw.motion(unit).mean[axis])
-        return size >= self._min_size and wrong.explains(size, rate, self._min_size)
+        rate, found = (self.raw.motion(k).mean[axis] for k in (unit, other))
+        least = self._min_size + SCALE * abs(nearest_zero((rate, found)))
+        differs = abs(found - rate) >= least
+        return differs and (
+            wrong is None or wrong.explains(rate, found, self._min_size)
+        )
 
     def _fail_alike(self, unit: int, axis: int) -> bool:
         """Return whether the others may be wrong on an axis, and an IMU that differs be healthy.
@@ -718,14 +739,14 @@ class Evidence:
         compared. They differ as if both had lost a similar part of their scale.
         """
         rate = abs(self.raw.motion(unit).mean[axis])
+        tracks = self._tracks
         return any(
-            axis in track.waits
+            axis in tracks[k].waits
             and self._pairs.get((k, other), UNCOMPARED).mean[axis]
             < ALIKE_SHARES * rate + self._min_size
-            and self._differs_by(track.wrong[axis], unit, other, axis)
-            for k, track in enumerate(self._tracks)
+            and self._differs_by(tracks[k].wrong[axis], unit, other, axis)
+            for k in self._delivering - {unit}
             for other in self._tracks[unit].partners.on[axis] - {k}
-            if k != unit
         )
 
     def _partners(

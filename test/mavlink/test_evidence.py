@@ -826,12 +826,14 @@ def without_scale(share: float = 0.5) -> Watched:
     return watched.run(1.0)
 
 
-@pytest.mark.parametrize("share", [0.44, 0.5, 0.6])
+@pytest.mark.parametrize(
+    ("first", "share"), [(0.5, 0.44), (0.5, 0.5), (0.5, 0.6), (1.5, 1.4), (2.0, 2.05)]
+)
 def test_one_without_scale_shows_nothing_by_agreeing_with_one_that_fails_alike(
-    share: float,
+    first: float, share: float
 ) -> None:
     """The monitor names the healthy one instead: in a hover before, so that it stays in use."""
-    watched = without_scale()
+    watched = without_scale(first)
     watched.gyros[1] = scaled(share)
     watched.states = [OK] * 7 + [FAULTY, OK]
     watched.run(1.0).rate = turning_fast
@@ -860,15 +862,47 @@ def test_one_that_has_healed_shows_that_beside_a_third_that_differs_otherwise(
     assert imu.agreed is not None
 
 
+def test_one_that_has_healed_shows_that_beside_one_that_never_sent() -> None:
+    evidence = Evidence(3, STEP, min_size=0.03)
+    evidence.remember({0: {"y": Wrong(1.0, 0.5)}})
+    for step in range(200):
+        now = START + step * STEP
+        rate = math.sin(2.1 * step * STEP / NS)
+        for unit in (0, 1):
+            evidence.raw.feed(unit, now, (0.0, round(rate, 3), 0.0))
+        evidence.hear([OK] * 9, now)
+        imus = evidence.look([True, True, False], [0], now)
+    assert not imus[0].waits
+
+
 def test_agreement_with_an_axis_that_the_monitor_doubts_shows_nothing() -> None:
+    """While the third one differs, in whatever way."""
     watched = without_scale()
+    watched.gyros[0] = sound
+    watched.gyros[2] = biased(0.5, axis=1)
+    watched.states = [OK] * 4 + [AMBIGUOUS, OK] + [OK, FAULTY, OK]
+    watched.out = [0, 2]
+    watched.rate = turning_fast
+    assert {watched.step()[0].waits for _ in range(200)} == {"y"}
+    watched.states[4] = OK
+    assert not watched.run(2.0).step()[0].waits
+
+
+@pytest.mark.parametrize("error", ["of scale, the third agrees", "at rest, too"])
+def test_agreement_with_a_doubted_axis_shows_enough_if_that_cannot_fail_alike(
+    error: str,
+) -> None:
+    """One axis may be doubted for an error of 0.02 rad/s as long as the flight lasts."""
+    watched = without_scale()
+    if error == "at rest, too":
+        watched.gyros[0] = biased(0.5, axis=1)
+        watched.run(1.0)
+        watched.gyros[2] = biased(0.08, axis=1)
     watched.gyros[0] = sound
     watched.states = [OK] * 9
     watched.states[4] = watched.states[7] = AMBIGUOUS
-    watched.rate = turning_fast
-    assert {watched.step()[0].waits for _ in range(200)} == {"y"}
-    watched.states[7] = OK
-    assert not watched.run(1.0).step()[0].waits
+    watched.run(1.0).rate = turning_fast
+    assert not watched.run(2.0).step()[0].waits
 
 
 def test_one_that_has_failed_again_is_not_trusted_for_a_turn_from_before() -> None:
@@ -894,11 +928,14 @@ def test_one_that_has_healed_and_turned_has_its_vote_again() -> None:
     assert watched.blamed(0.5) == {2}
 
 
-def test_a_new_name_does_not_blame_the_one_from_which_two_differ_alike() -> None:
+@pytest.mark.parametrize(("first", "second"), [(0.5, 0.4), (2.0, 2.1)])
+def test_a_new_name_does_not_blame_the_one_from_which_two_differ_alike(
+    first: float, second: float
+) -> None:
     """The second one loses scale as the first one did; the monitor names the healthy third."""
-    watched = without_scale()
+    watched = without_scale(first)
     watched.states = [OK] * 9
-    watched.gyros[1] = scaled(0.4)
+    watched.gyros[1] = scaled(second)
     watched.run(1.0).rate = turning_fast
     watched.states[7] = FAULTY
     assert watched.blamed(4.0) == set()
@@ -963,18 +1000,37 @@ def test_after_a_restart_one_that_waits_has_no_vote() -> None:
 
 
 @pytest.mark.parametrize(
-    ("share", "least", "most"),
-    [(0.1, 0.30, 0.36), (0.4, 0.60, 0.66), (0.8, 0.85, 0.91), (1.1, 0.85, 0.91)],
+    ("share", "less", "too_little", "more", "too_much"),
+    [
+        (0.1, 0.70, 0.64, 1.30, 1.36),
+        (0.4, 0.40, 0.34, 1.60, 1.66),
+        (0.8, 0.15, 0.09, 2.00, 2.06),
+        (1.1, 0.15, 0.09, 2.30, 2.36),
+        (1.3, math.nan, 0.90, math.nan, 1.1),
+    ],
 )
-def test_a_loss_explains_differences_by_a_share_and_two_tenths_more(
-    share: float, least: float, most: float
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_an_error_of_scale_explains_rates_within_two_tenths(
+    share: float,
+    less: float,
+    too_little: float,
+    more: float,
+    too_much: float,
+    sign: float,
 ) -> None:
-    """At 1 rad/s, with errors of 0.03 rad/s at rest."""
+    """Beside a gyro that measures 1 rad/s, with errors of 0.03 rad/s at rest."""
     wrong = Wrong(1.0, share)
-    assert wrong.explains(least, 1.0, 0.03)
-    assert not wrong.explains(most, 1.0, 0.03)
-    assert not Wrong(1.0, 1.5).explains(0.1, 1.0, 0.03), "an error at rest"
-    assert UNKNOWN.explains(0.85, 1.0, 0.03), "it may have lost any share"
+    for rate, is_explained in (
+        (less, True),
+        (too_little, False),
+        (more, True),
+        (too_much, False),
+    ):
+        found = wrong.explains(sign, sign * rate, 0.03)
+        assert math.isnan(rate) or found == is_explained
+    # It may have been any error.
+    assert UNKNOWN.explains(sign, 0.15 * sign, 0.03)
+    assert UNKNOWN.explains(sign, 2.2 * sign, 0.03)
 
 
 @pytest.mark.parametrize("rate", [0.013, 0.4, 1.25, 30.0, math.inf])
