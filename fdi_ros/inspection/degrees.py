@@ -42,14 +42,9 @@ STILL, ALWAYS_STILL = 0.3, 0.95
 LEAST_REST = 4.0
 #: noise of a sample at rest, rad/s, that no gyro has
 NOISIEST = 0.02
-#: bias of one of several units with such noise, and smallest difference of two biases,
-#: rad/s: uncalibrated gyros have 0.035, and 0.04 between them
-NOISY_BIAS, NOISY_APART = 0.06, 0.04
 #: smallest rotation in gentle motion, rad/s, and over the noise of its mean, of which
 #: three quantiles are compared
 GENTLE_ROTATION, GENTLE_OVER_NOISE = 0.01, 10.0
-#: smallest and largest ratio of the noise at rest of a unit in deg/s to that of others
-NOISE_RATIOS = (35.0, 90.0)
 
 
 def in_degrees(
@@ -77,8 +72,6 @@ def in_degrees(
                 f"{figures(factor)} times the rotation of {shown(slow_one.topic.name)}"
             )
             return f"rad/s: {shown(fast_one.topic.name)} is in deg/s, it shows {times}"
-    if words := _one_at_rest(chosen):
-        return f"rad/s: {words}"
     if chosen and all(_is_beyond(one, largest_rate) for one in chosen):
         largest = max(one.largest for one in chosen)
         why = f"{figures(largest)} rad/s would be {figures(largest / 2 / math.pi, 2)} turns a second"
@@ -107,28 +100,6 @@ def _mean_noise(report: TopicReport) -> float:
     quiet = float(report.segments.noise().quiet.min())
     samples = max(1.0, (report.rate or 1.0) * SEGMENT_LENGTH / REST_BLOCKS)
     return quiet / math.sqrt(samples) if math.isfinite(quiet) else math.inf
-
-
-def _one_at_rest(chosen: Sequence[TopicReport]) -> str:
-    """Return which one unit rests with the noise and bias of others in deg/s. Empty: none."""
-    rests = [_rest_of(one) for one in chosen]
-    loud = [k for k, one in enumerate(rests) if one.noise > NOISIEST]
-    if len(loud) != 1 or len(rests) < 2:
-        return ""
-    odd = rests[loud[0]]
-    usual = float(np.median([one.noise for one in rests if one is not odd]))
-    bias = float(np.abs(odd.bias).max())
-    rested = min(one.seconds for one in rests) >= LEAST_REST
-    if not usual or not rested or bias < NOISY_BIAS:
-        return ""
-    times = odd.noise / usual
-    if not NOISE_RATIOS[0] < times < NOISE_RATIOS[1]:
-        return ""
-    name = shown(chosen[loud[0]].topic.name)
-    return (
-        f"{name} is in deg/s, at rest it has {figures(times)} times the noise of the others"
-        f" and a bias of {figures(bias, 2)} rad/s"
-    )
 
 
 def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
@@ -179,14 +150,12 @@ def _no_gyros_at_rest(chosen: Sequence[TopicReport]) -> bool:
     between units, or the units rest for much of the recording and move in between.
     """
     rests = [_rest_of(one) for one in chosen]
-    if any(one.noise <= NOISIEST or one.seconds < LEAST_REST for one in rests):
-        return False
-    biases = [float(np.abs(one.bias).max()) for one in rests]
-    rests_long = all(STILL < one.share < ALWAYS_STILL for one in rests)
-    if min(biases) > LARGEST_BIAS and rests_long:
+    for one in rests:
+        loud = one.noise > NOISIEST and np.abs(one.bias).max() > LARGEST_BIAS
+        if not loud or one.seconds < LEAST_REST:
+            return False
+    if all(STILL < one.share < ALWAYS_STILL for one in rests):
         return True
-    if max(biases) < NOISY_BIAS:
-        return False
     apart = [
         float(np.linalg.norm(one.bias - other.bias))
         if _are_mounted_alike(first, second)
@@ -195,7 +164,7 @@ def _no_gyros_at_rest(chosen: Sequence[TopicReport]) -> bool:
             zip(chosen, rests, strict=True), 2
         )
     ]
-    return max(apart, default=0.0) > NOISY_APART
+    return max(apart, default=0.0) > LARGEST_BIAS
 
 
 def _are_mounted_alike(first: TopicReport, second: TopicReport) -> bool:

@@ -18,8 +18,9 @@ from fdi_ros.mavlink.protocol import NS
 
 _NEAR = 8
 """Largest step of a number that continues a series, and largest delay of a late one."""
-_LASTS = 3 * NS
-"""Two series must go on beside each other for this time, ns."""
+_LASTS = 10 * NS
+"""Two series must go on beside each other for this time, ns. A second path of one sender that is late by less
+looks like another sender for a shorter time: while it brings what the first path lost."""
 _PRESENT = NS
 """A series is over after this time without a message, ns."""
 _MOST_IDLE = 128
@@ -29,7 +30,7 @@ _LEAST_MESSAGES = 50
 _LEAST_COMPLETE = 0.6
 """Smallest share of the numbers of a series that came. Two paths of one sender have 1 together."""
 _MOST_SERIES = 8
-_COPIES = 4096
+_COPIES = 16384
 """Messages among which copies are found."""
 REMEMBERED = 10 * NS
 """Two senders are reported for this time after they were last found, ns."""
@@ -40,10 +41,11 @@ class _Series:
     """Numbers that continue each other."""
 
     last: int  # largest number so far, modulo 256
-    begun: int  # arrival of the first message, ns
+    begun: int  # begin of the present window, ns
     at: int  # arrival of the last message, ns
-    came: int = 1
-    missing: int = 0
+    came: int = 1  # messages in the present window
+    missing: int = 0  # numbers that did not come in it
+    was_complete: bool = False  # in the window before
     idle: int = 0  # messages of other series since the last one
     recent: set[int] = field(default_factory=set)  # numbers up to `_NEAR` behind
 
@@ -57,6 +59,10 @@ class _Series:
 
     def take(self, number: int, now: int) -> None:
         """Take a message with a number that is ahead, or that was missing."""
+        if now - self.begun >= _LASTS:
+            self.was_complete = self.came >= _LEAST_MESSAGES and self._is_dense()
+            self.begun = now
+            self.came = self.missing = 0
         step = self.step_to(number)
         if step <= _NEAR:
             self.missing += step - 1
@@ -70,13 +76,11 @@ class _Series:
         self.at = now
 
     def is_complete(self, now: int) -> bool:
-        """Whether the series is present, and nearly complete for some seconds."""
-        return (
-            now - self.at <= _PRESENT
-            and self.at - self.begun >= _LASTS
-            and self.came >= _LEAST_MESSAGES
-            and self.came >= _LEAST_COMPLETE * (self.came + self.missing)
-        )
+        """Whether the series is present, and nearly complete in the window before and in this one."""
+        return now - self.at <= _PRESENT and self.was_complete and self._is_dense()
+
+    def _is_dense(self) -> bool:
+        return self.came >= _LEAST_COMPLETE * (self.came + self.missing)
 
 
 class Senders:

@@ -230,8 +230,8 @@ class Concern(NamedTuple):
 def checked_share(checked: int, finite: int) -> float:
     """Return the share of the values of a channel whose fault the others could have shown.
 
-    Samples without a value of the channel do not count, so a slow unit gets the share of the
-    samples that it delivered. A channel that never delivered was not checked.
+    Samples without a value of the channel do not count. A unit that delivers less than a third
+    of the samples is UNCHECKED or STALE in between, and then 0 of its values were checked.
     """
     return checked / finite if finite else 0.0
 

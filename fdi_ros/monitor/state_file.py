@@ -25,7 +25,7 @@ from fdi_ros.core.subsets import mask_of, members
 from fdi_ros.detectors.base import Detector
 from fdi_ros.errors import ConfigError
 from fdi_ros.estimator.delays import LONGEST_DELAY
-from fdi_ros.estimator.error_states import predict
+from fdi_ros.estimator.error_states import places_of, predict
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.accelerometers import possible_units
 from fdi_ros.monitor.pipeline import Pipeline
@@ -106,9 +106,13 @@ def _errors(detector: Detector) -> dict[str, Array] | None:
     estimator = detector.states[0]["estimator"]
     count = int(detector.constants[0]["layout"]["count"])
     x = estimator["states"]["x"][:count]
-    p = estimator["states"]["p"][:count, :count]
-    late = estimator["late"][: len(detector.geometry.units)]
-    return {"value": x.copy(), "covariance": p.copy(), "late": late.copy()}
+    p = estimator["states"]["p"][:count, :count].copy()
+    units = len(detector.geometry.units)
+    late = estimator["late"][:units]
+    # What vibration may have taught of delays is not saved by itself.
+    delays = [place for (place,) in places_of("delay", detector.geometry.n, units)]
+    p[delays, delays] += estimator["taught_delay"][1:units] ** 2
+    return {"value": x.copy(), "covariance": p, "late": late.copy()}
 
 
 def _as_json(figures: Array) -> list[float]:

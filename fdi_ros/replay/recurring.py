@@ -98,7 +98,7 @@ def join_noise(
         until = min(max(time.until_s for time in times), end)
         for later in list(left):
             if later.measured_in == one.measured_in and _is_inside(
-                later, until, run, unit_of
+                later, until, run, times[0].channel, unit_of
             ):
                 run.append(later)
                 left.remove(later)
@@ -134,14 +134,18 @@ def _noise_after(
 
 
 def _is_inside(
-    later: Episode, until: float, run: Sequence[Episode], unit_of: Mapping[str, str]
+    later: Episode,
+    until: float,
+    run: Sequence[Episode],
+    noisy: str,
+    unit_of: Mapping[str, str],
 ) -> bool:
-    """Whether a later set is one more of a unit that is noisy until a time, s."""
+    """Whether a later set may be of the unit with a noisy channel, until a time, s."""
     return (
         later.state == "AMBIGUOUS"
         and later.stretch == run[0].stretch
         and later.start_s <= until + RECURS_WITHIN
-        and bool(_units_behind(run, unit_of) & _units_behind([later], unit_of))
+        and unit_of[noisy] in _units_behind([later], unit_of)
     )
 
 

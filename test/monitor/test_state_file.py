@@ -316,3 +316,19 @@ def test_a_restored_bias_is_as_old_as_the_walk_of_its_own_channel(path):
     known = after.core["sample"]["bias_std"][0, :6]
     start = before.core["settings"]["learned"][0, :6]
     assert known == pytest.approx(np.hypot(start, 30.0 * np.array(walk)), rel=0.01)
+
+
+def test_a_delay_that_vibration_may_have_taught_is_as_uncertain_after_a_restart(path):
+    settings = parallel(2, detector__name="sequential")
+    pipeline, again = Pipeline(settings), Pipeline(settings)
+    z = np.random.default_rng(0).normal(0.0, SIGMA, (400, pipeline.geometry.n))
+    stamps = START + 10_000_000 * np.arange(400, dtype=np.int64)
+    pipeline.process(Block(stamps, z))
+    pipeline.guard.states[0]["estimator"]["taught_delay"][1] = 0.01
+    before = pipeline.status().units[1].delay_std
+    assert before > 0.01
+    StateFile(path, 3600.0).save(pipeline)
+    assert StateFile(path, 3600.0).restore(again)
+    estimator = again.guard.states[0]["estimator"]
+    (place,) = places_of("delay", again.geometry.n, 2)[0]
+    assert np.sqrt(estimator["states"]["p"][place, place]) >= 0.999 * before

@@ -158,6 +158,19 @@ def test_a_set_that_passes_into_noise_of_its_unit_is_one_episode_of_the_unit():
     assert other == run[1]
 
 
+@pytest.mark.parametrize(
+    "later", [("imu_1.y", "imu_2.y"), ("imu_2.y", "imu_2.z"), ("imu_1.x", "imu_1.y")]
+)
+def test_a_later_set_without_the_noisy_unit_stays(later):
+    run = [
+        episode(6.0, ("imu_2.x", "imu_3.x")),
+        episode(20.0, later, length=20.0, stands=True),
+    ]
+    one, other = join_noise(run, noise("imu_3.x", "imu_3.y"), STRETCHES, UNIT_OF)
+    assert one.who == "imu_3"
+    assert other == run[1]
+
+
 def test_noise_tells_which_unit_of_a_set_is_loose():
     every = tuple(name for name in UNIT_OF if "accel" not in name)
     found = noise("imu_2.x", "imu_2.y")
