@@ -221,13 +221,17 @@ class Failover:
     def _saved(self, now: int) -> Saved:
         """Return the content of the file."""
         clocks = self._clocks()
-        ago = (now - (self._booted or now)) / NS
-        return Saved(
+        known = self._file.written
+        if self._booted is not None:
+            ago = (now - self._booted) / NS
+            known = known._replace(
+                booted=clocks.unix - ago,
+                after=clocks.uptime - ago,
+                computer=clocks.boot,
+            )
+        return known._replace(
             system=self._system,
             out=self.out,
-            booted=clocks.unix - ago,
-            after=clocks.uptime - ago,
-            computer=clocks.boot,
             without_notch=self._without_notch,
             bad=tuple(map(self.evidence.bad, self.out)),
         )

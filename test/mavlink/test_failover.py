@@ -1324,7 +1324,7 @@ def test_a_second_autopilot_of_the_same_system_is_not_ready(
     other = Autopilot("ardupilot", boot=flying.now - 30 * NS, rates=rates)
     flying.autopilots = (*flying.autopilots, other)
     flying.peers = (*flying.peers, flying.peers[0])
-    assert reason(flying.run(6.0)) == "no failover: two senders with one system id"
+    assert reason(flying.run(20.0)) == "no failover: two senders with one system id"
     flying.autopilots, flying.peers = flying.autopilots[:1], flying.peers[:1]
     assert reason(flying.run(30.0)) == "ready"
 

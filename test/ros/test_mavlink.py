@@ -166,6 +166,8 @@ def test_what_is_out_of_use_is_put_back_on_the_ground_if_the_monitor_reports_no_
         "autopilot_booted": clocks.unix + autopilot.boot / NS,
         "after_computer": clocks.uptime + autopilot.boot / NS,
         "computer_boot": clocks.boot,
+        "bad_axes": ["xyz"],
+        "bad_errors": [{axis: [0.3, 1.0] for axis in "xyz"}],
     }
     file.write_text(json.dumps(saved))
     failover = {
