@@ -476,7 +476,7 @@ def warming_words(one: Episode, unit: Unit = RADIANS) -> str:
         several = len(alike) > 1
         errors = "their errors" if several else "its error"
         slopes = listed(
-            [figures(abs(each.rad_s_per_c) * unit.factor, 2) for each in alike]
+            [figures(abs(each.slope_per_c) * unit.factor, 2) for each in alike]
         )
         change = alike[0].range_c
         size = f"({slopes} {unit.name} per °C over {figures(abs(change), 2)} °C)"

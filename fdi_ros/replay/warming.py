@@ -55,8 +55,8 @@ class Warming:
     """Name of the channel."""
     unit: str
     """Name of its unit."""
-    rad_s_per_c: float
-    """Change of the error with the temperature, rad/s per degC."""
+    slope_per_c: float
+    """Change of the error with the temperature, in the unit of the channel (rad/s or m/s^2) per degC."""
     range_c: float
     """Difference of the highest and the lowest temperature, degC. Negative: the unit cools."""
     explained: float

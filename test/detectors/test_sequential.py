@@ -434,6 +434,17 @@ def test_units_may_be_listed_in_any_order():
     assert pipeline.status().delay_std == expected
 
 
+def std_of_delay(rate, late, seconds, seed):
+    """Return the standard deviation of the delay of the second of two units, s. Its error is within three of them."""
+    z = np.hstack([rate(seconds), rate(seconds - late)])
+    z += SIGMA * white(seed, len(seconds))
+    pipeline = Pipeline.from_config(parallel(2, detector__name="sequential"))
+    pipeline.process(stamped(seconds, z))
+    status = pipeline.status()
+    assert abs(status.delays[1] - late) < 3.0 * status.delay_std[1]
+    return status.delay_std[1]
+
+
 @pytest.mark.parametrize("late", [0.0, 0.005, 0.02])
 def test_a_delay_is_learned_in_slow_motion(late):
     """At 0.3 rad/s, with periods of 5 s and more, well within a minute."""
@@ -443,13 +454,7 @@ def test_a_delay_is_learned_in_slow_motion(late):
         turn = np.sin(np.outer(t, [0.6, 0.9, 1.2]))
         return 0.3 * np.clip(t - 6.0, 0.0, 1.0)[:, None] * turn
 
-    z = np.hstack([rate(seconds), rate(seconds - late)])
-    z += SIGMA * white(5, len(seconds))
-    pipeline = Pipeline.from_config(parallel(2, detector__name="sequential"))
-    pipeline.process(stamped(seconds, z))
-    status = pipeline.status()
-    assert abs(status.delays[1] - late) < 3.0 * status.delay_std[1]
-    assert status.delay_std[1] < 0.006
+    assert std_of_delay(rate, late, seconds, 5) < 0.006
 
 
 def turning(pipeline, turn, seconds, seed):
@@ -536,13 +541,7 @@ def test_a_delay_is_learned_within_seconds_of_motion(late, hertz):
         turn = np.sin(2 * np.pi * hertz * np.outer(t, [1.0, 0.8, 1.2]))
         return 0.5 * np.clip(t - 6.0, 0.0, 1.0)[:, None] * turn
 
-    z = np.hstack([rate(seconds), rate(seconds - late)])
-    z += SIGMA * white(6, len(seconds))
-    pipeline = Pipeline.from_config(parallel(2, detector__name="sequential"))
-    pipeline.process(stamped(seconds, z))
-    status = pipeline.status()
-    assert abs(status.delays[1] - late) < 3.0 * status.delay_std[1]
-    assert status.delay_std[1] < 0.0015
+    assert std_of_delay(rate, late, seconds, 6) < 0.0015
 
 
 def flown_with_a_hole(units, hole, fault, seed):

@@ -273,7 +273,7 @@ def test_recordings_of_a_minute_and_of_hours_have_the_same_slope(count, rate):
         "imu_1",
         True,
     )
-    assert warming.rad_s_per_c == pytest.approx(0.002, rel=0.03)
+    assert warming.slope_per_c == pytest.approx(0.002, rel=0.03)
     assert warming.range_c == pytest.approx(12.0, abs=0.7)
 
 
@@ -282,7 +282,7 @@ def test_channels_that_warm_beside_it_are_no_reference():
     data = stream(3_000, 50.0, warm=(0, 3))
     first, second = declared("imu_1.x"), declared("imu_2.x")
     (warming,) = explained(*data, first, others=(second,)).warming
-    assert warming.rad_s_per_c == pytest.approx(0.002, rel=0.03)
+    assert warming.slope_per_c == pytest.approx(0.002, rel=0.03)
 
 
 def test_values_without_data_and_copies_are_no_reference():
@@ -296,7 +296,7 @@ def test_values_without_data_and_copies_are_no_reference():
     assert explained(*data, declared("imu_1.x"), state).warming == ()
     values[:, 8] = values[:, 5]
     (warming,) = explained(*data, declared("imu_1.x"), state).warming
-    assert warming.rad_s_per_c == pytest.approx(0.002, rel=0.03)
+    assert warming.slope_per_c == pytest.approx(0.002, rel=0.03)
 
 
 def test_a_set_is_told_of_as_a_possibility():
