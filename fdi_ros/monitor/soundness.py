@@ -59,6 +59,10 @@ LEAST_SPIKES = 3
 """Spikes from which on they are reported. Fewer may be chance."""
 
 
+STAYED_OUT = "remained left out"
+"""First words on a channel that the operator has taken out up to the end."""
+
+
 class Word(str, Enum):
     """First word of a verdict."""
 
@@ -178,6 +182,7 @@ class Trouble(Enum):
     INPUT = "check what publishes the messages of {who}"
     COPY = "give {who} a sensor of its own: check wiring and driver"
     DOUBT = "make a longer recording: the suspicion of {who} is still open"
+    EXCLUDED = "shorten excluded_channels to use all channels of {who}"
     DRIFT = "let {who} warm up before the flight; replace it if its bias moves again"
     SCALE = "check the range that the driver of {who} sets, and measure the scale factors (fdi setup)"
     END_OF_RANGE = "choose a larger range for {who}"
@@ -410,7 +415,7 @@ def _slow_words(unit: UnitHealth) -> str:
     if unit.slow_from_s is None:
         return f"{words} ({rates})"
     until = "to the end" if unit.slow_to_s is None else f"to {unit.slow_to_s:.0f} s"
-    return f"{words} ({rates} from {unit.slow_from_s:.0f} s {until})"
+    return f"{words} (from {unit.slow_from_s:.0f} s {until} at {rates})"
 
 
 def _unit_concerns(units: Sequence[UnitHealth]) -> list[Concern]:
@@ -537,7 +542,12 @@ def _doubts(some: Sequence[ChannelHealth]) -> list[Concern]:
     for one in some:
         by_words.setdefault(one.doubt, []).append(one.name)
     return [
-        Concern(Word.LOOK, Trouble.DOUBT, tuple(names), words)
+        Concern(
+            Word.LOOK,
+            Trouble.EXCLUDED if words.startswith(STAYED_OUT) else Trouble.DOUBT,
+            tuple(names),
+            words,
+        )
         for words, names in by_words.items()
     ]
 

@@ -471,10 +471,14 @@ def warming_words(one: Episode, unit: Unit = RADIANS) -> str:
             each for each in one.warming if (each.unit, each.certain) == (who, certain)
         ]
         names = listed([each.channel for each in alike])
-        if one.state == "AMBIGUOUS":
-            names += ", if faulty"
         several = len(alike) > 1
-        errors = "their errors" if several else "its error"
+        if one.state == "AMBIGUOUS":
+            are = "are" if several else "is"
+            errors = (
+                f"If {names} {are} faulty, {'their errors' if several else 'its error'}"
+            )
+        else:
+            errors = f"The {'errors' if several else 'error'} of {names}"
         slopes = listed(
             [figures(abs(each.slope_per_c) * unit.factor, 2) for each in alike]
         )
@@ -484,13 +488,13 @@ def warming_words(one: Episode, unit: Unit = RADIANS) -> str:
             verb = "follow" if several else "follows"
             cause = "cooling" if change < 0.0 else "warming"
             sentences.append(
-                f"{names}: {errors} {verb} the temperature of {who} {size}: {cause}."
+                f"{errors} {verb} the temperature of {who} {size}, so the cause is {cause}."
             )
         else:
             verb = "change" if several else "changes"
             sentences.append(
-                f"{names}: {errors} {verb} with the temperature of {who} {size}. It may be"
-                " heat or a steady drift: this recording cannot show which."
+                f"{errors} {verb} with the temperature of {who} {size}. The cause may be heat or"
+                " a steady drift: this recording cannot show which."
             )
     return " ".join(sentences)
 
@@ -598,7 +602,8 @@ def detail_words(
         if rivals := _rivals(one):
             lines.append(("alternative", rivals))
         if heat := warming_words(one, unit):
-            lines.append(("temperature", heat.removesuffix(".")))
+            words = heat[0].lower() + heat[1:].removesuffix(".")
+            lines.append(("temperature", words))
     what = "rate" if one.measured_in == RADIANS.name else "specific force"
     return [*lines, (f"fused {what}", _rate(one, unit)), *injected]
 

@@ -35,7 +35,12 @@ from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
-from fdi_ros.monitor.soundness import RateHealth, UnitHealth, checked_share
+from fdi_ros.monitor.soundness import (
+    STAYED_OUT,
+    RateHealth,
+    UnitHealth,
+    checked_share,
+)
 from fdi_ros.monitor.status import Status
 from fdi_ros.replay.episodes import STRETCH_GAP, Story, join_halves, pieces
 from fdi_ros.replay.health import (
@@ -471,7 +476,7 @@ def _joined(
 def _doubt_words(state: str, since: float | None, reason: str, end: float) -> str:
     """Return why an undeclared channel is not used at the end. Empty: it is used."""
     if state == "EXCLUDED":
-        return f"remained left out: {reason}"
+        return f"{STAYED_OUT}: {reason}"
     if state != "SUSPECT" or since is None or end - since < SILENT_TO_END:
         return ""
     return f"remained suspected from {since:.1f} s to the end ({reason})"

@@ -303,8 +303,8 @@ def test_a_set_is_told_of_as_a_possibility():
     data = stream(3_000, 50.0, warm=(0, 1))
     one = explained(*data, declared("imu_1.x", "imu_1.y", state="AMBIGUOUS"))
     assert one.warming_words.startswith(
-        "imu_1.x and imu_1.y, if faulty: their errors follow the temperature of imu_1"
-        " (0.002 and 0.002 rad/s per °C over 11 °C): warming."
+        "If imu_1.x and imu_1.y are faulty, their errors follow the temperature of imu_1"
+        " (0.002 and 0.002 rad/s per °C over 11 °C), so the cause is warming."
     )
 
 
@@ -321,14 +321,14 @@ def test_the_words_have_the_unit_of_the_page_and_of_the_sensor():
     warming = Warming("imu_1.x", "imu_1", -0.002, -8.04, 0.97, True)
     one = episode(10.0, ("imu_1.x",), state="FAULTY", warming=(warming,))
     assert warming_words(one, DEGREES) == (
-        "imu_1.x: its error follows the temperature of imu_1"
-        " (0.11 deg/s per °C over 8 °C): cooling."
+        "The error of imu_1.x follows the temperature of imu_1"
+        " (0.11 deg/s per °C over 8 °C), so the cause is cooling."
     )
     left_open = Warming("imu_1.accel_x", "imu_1", 0.02, 8.0, 0.97, False)
     other = episode(10.0, ("imu_1.accel_x",), state="FAULTY", warming=(left_open,))
     assert warming_words(other, DEGREES) == (
-        "imu_1.accel_x: its error changes with the temperature of imu_1"
-        " (0.02 m/s^2 per °C over 8 °C). It may be heat or a steady drift:"
+        "The error of imu_1.accel_x changes with the temperature of imu_1"
+        " (0.02 m/s^2 per °C over 8 °C). The cause may be heat or a steady drift:"
         " this recording cannot show which."
     )
     whole = episode(10.0, ("imu_1.x",), state="FAULTY", halves=(one, other))
@@ -367,7 +367,7 @@ def log(path, course, error, seconds=90.0, rate=25.0):
         (
             curved,
             lambda time, heat: 0.0035 * heat,
-            r"follows the temperature of imu_2 \(0\.003[45]\d* rad/s per °C over 12 °C\): warming\.",
+            r"follows the temperature of imu_2 \(0\.003[45]\d* rad/s per °C over 12 °C\), so the cause is warming\.",
         ),
         (curved, lambda time, heat: 0.04 * (time > 45.0), ""),
         (flat, lambda time, heat: 0.0005 * time, ""),
@@ -395,13 +395,13 @@ def test_a_log_tells_warming_from_other_faults(fdi, tmp_path, course, error, wor
             assert "the temperature of" not in text
         assert all(not one["warming"] for one in episodes)
         return
-    assert re.search(rf" imu_2\.x: its error {words}", first)
-    assert re.search(rf"\n       temperature: imu_2\.x: its error {words[:-3]}", out)
-    assert re.search(rf"imu_2\.x: its error {words}", found["verdict"]["words"])
-    assert re.search(rf"^imu_2\.x: its error {words}", episodes[0]["warming_words"])
+    assert re.search(rf" The error of imu_2\.x {words}", first)
+    assert re.search(rf"\n       temperature: the error of imu_2\.x {words[:-3]}", out)
+    assert re.search(rf"The error of imu_2\.x {words}", found["verdict"]["words"])
+    assert re.search(rf"^The error of imu_2\.x {words}", episodes[0]["warming_words"])
     (warming,) = episodes[0]["warming"]
     assert (warming["channel"], warming["unit"]) == ("imu_2.x", "imu_2")
-    assert "imu_2.x: its error" in page.read_text(encoding="utf-8")
+    assert "he error of imu_2.x" in page.read_text(encoding="utf-8")
 
 
 def test_what_is_declared_is_the_same_without_a_thermometer(tmp_path):
@@ -421,8 +421,8 @@ def test_what_is_declared_is_the_same_without_a_thermometer(tmp_path):
 def test_the_imu_that_warms_before_a_real_crash_is_said_to_warm():
     result = replay(CRASH)
     words = (
-        "imu_1.x and imu_1.y: their errors follow the temperature of imu_1"
-        " (0.0025 and 0.003 rad/s per °C over 11 °C): warming."
+        "The errors of imu_1.x and imu_1.y follow the temperature of imu_1"
+        " (0.0025 and 0.003 rad/s per °C over 11 °C), so the cause is warming."
     )
     assert words in result.verdict.sentence
     (one,) = result.story.declared
