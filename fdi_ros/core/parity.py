@@ -43,10 +43,13 @@ def update_normal(
 @compiled
 def eliminate_rate(
     parity: Parity, n: int, axes: Array, prior_information: float
-) -> None:
-    """Calculate A and G from W. ``prior_information`` is k, s^2/rad^2."""
+) -> float:
+    """Calculate A and G from W; return the log of the determinant of H' W H + K.
+
+    ``prior_information`` is k, s^2/rad^2.
+    """
     update_normal(parity, n, axes, prior_information)
-    invert(parity.normal, 3, parity.inverse)
+    log_det = invert(parity.normal, 3, parity.inverse)
     for a in range(3):
         for i in range(n):
             parity.gain[a, i] = along(parity.inverse[a], parity.weighted[i])
@@ -56,6 +59,7 @@ def eliminate_rate(
             for a in range(3):
                 total -= parity.weighted[i, a] * parity.gain[a, j]
             parity.information[i, j] = parity.information[j, i] = total
+    return log_det
 
 
 @compiled
@@ -80,8 +84,8 @@ def fill_joint_parity(
     mask: int,
     covariance: Array,
     prior_information: float,
-) -> None:
-    """Calculate A and G for correlated errors.
+) -> float:
+    """Calculate A and G for correlated errors; return the log of the determinants of M and of H' W H + K.
 
     ``covariance`` (n, n) of the errors, (rad/s)^2, and ``prior_information`` the prior
     information k of the rate, s^2/rad^2.
@@ -94,7 +98,7 @@ def fill_joint_parity(
             count += 1
             for q in range(count):
                 parity.information[count - 1, q] = covariance[i, parity.place[q]]
-    invert(parity.information, count, parity.weight)
+    log_det = invert(parity.information, count, parity.weight)
     for p in range(count):
         for q in range(count):
             parity.information[p, q] = parity.weight[p, q]
@@ -104,7 +108,7 @@ def fill_joint_parity(
     for p in range(count):
         for q in range(count):
             parity.weight[parity.place[p], parity.place[q]] = parity.information[p, q]
-    eliminate_rate(parity, n, sensors.axes, prior_information)
+    return log_det + eliminate_rate(parity, n, sensors.axes, prior_information)
 
 
 @compiled

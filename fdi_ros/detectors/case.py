@@ -40,6 +40,13 @@ from fdi_ros.detectors.naming import (
     unexplained,
 )
 from fdi_ros.detectors.onset import explain_change, samples_of_change
+from fdi_ros.detectors.returning import (
+    References,
+    believe_noise,
+    find_returned,
+    keep_reference,
+    return_biases,
+)
 from fdi_ros.detectors.sums import (
     BLOCKS_PER_VALUE,
     KEPT,
@@ -64,6 +71,7 @@ from fdi_ros.estimator.estimator import (
 )
 from fdi_ros.estimator.noise import (
     BLOCK,
+    QUARTER,
     SAMPLE,
     SCALES,
     THREE_SIGMA,
@@ -174,6 +182,7 @@ class Case:
     moved_since: Whole  # first sample that showed the last move
     reference: Channels  # biases before the last move, rad/s
     farthest: Real  # from these without a fault, rad/s
+    references: References  # biases before the last moves
     inference: Inference
 
 
@@ -323,10 +332,7 @@ def open_case(params: Constants, state: State, least: float) -> bool:
     case.unsolved = 0.0
     copy_states(params.layout, kf.states, case.before)
     since = (kf.samples - case.onset) * params.period
-    before = kf.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
-    if case.onset == kf.hole_sample + 1:
-        before = kf.hole_at
-    predict_from(params, kf, before, kf.states)
+    predict_from(params, kf, time_before(params, kf, case), kf.states)
     # Stamps may be a block off.
     if kf.seconds - since < kf.changed_at - BLOCK_TIME:
         # Some samples since the onset belong to another specific force.
@@ -342,6 +348,43 @@ def open_case(params: Constants, state: State, least: float) -> bool:
         case.retry = kf.samples + 1 + wait
         return False
     return True
+
+
+@compiled
+def time_before(params: Constants, kf: Estimator, case: Case) -> float:
+    """Return a time that is surely before the onset, s since the start: the onset is not known exactly."""
+    if case.onset == kf.hole_sample + 1:
+        return kf.hole_at
+    since = (kf.samples - case.onset) * params.period
+    return kf.seconds - since - max(SNAPSHOT_TIME, 0.3 * since)
+
+
+@compiled
+def follow_moves(params: Constants, state: State) -> None:
+    """Look every quarter of a second whether all biases have returned from a move, and take those from before it.
+
+    While a case is open, their evidence must exceed that of the likeliest fault.
+    """
+    kf = state.estimator
+    case = state.case
+    inference = case.inference
+    lately = case.moved > 0.0 and kf.seconds - case.moved_at < WARMS
+    due = kf.all_blocks % BLOCKS_PER_VALUE[QUARTER] == 0
+    if not due or not (lately or case.open) or case.references.count == 0:
+        return
+    size = BLOCKS_PER_VALUE[QUARTER] * params.length
+    least = OPENING_SHARE * math.log(params.limit)
+    if case.open:
+        least = max(least, inference.log_odds)
+    inference.moved = 0.0
+    fill_louder(params, state, size)
+    set_mean(params, kf, inference, size)
+    believe_noise(params, kf, inference)
+    best = find_returned(params, kf, case.references, inference, least)
+    if best >= 0:
+        return_biases(params, kf, case.references, best)
+        forget_evidence(params, state)
+        update_weights(params, kf)
 
 
 @compiled
@@ -814,6 +857,8 @@ def let_biases_move(params: Constants, state: State, std: float) -> None:
     kf = state.estimator
     case = state.case
     n = params.sensors.n
+    if predict_from(params, kf, time_before(params, kf, case), case.before):
+        keep_reference(params, kf, case.before, case.references)
     case.moved = lately_moved(state) + std
     case.moved_at = kf.seconds
     case.moved_since = case.onset

@@ -24,6 +24,7 @@ from fdi_ros.detectors.case import (
     State,
     fade_fits,
     follow_case,
+    follow_moves,
     forget_evidence,
     forget_fits,
     goes_too_far,
@@ -148,6 +149,8 @@ def pass_time(params: Constants, state: State, sample: SampleInput) -> float:
     if sample.interrupted and kf.samples > 0:
         forget_motion(kf, params.sensors.n)
         forget_evidence(params, state)
+        # In a hole biases walk farther than those from before a move allow for.
+        state.case.references.count = 0
         pass_hole(params, kf, seconds)
         if seconds > LONGEST_HOLE:
             kf.noise.regime_seconds[REST] = kf.noise.regime_seconds[MOTION] = 0.0
@@ -207,6 +210,7 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     predict(params.layout, kf.states, kf.seconds - kf.learned_at)
     kf.learned_at = kf.seconds
     follow_reference(params, state)
+    follow_moves(params, state)
     if kf.blocks < FEWEST_BLOCKS:
         return
     kf.unseen = False
