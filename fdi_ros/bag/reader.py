@@ -42,6 +42,7 @@ from fdi_ros.bag.ulog import Ulog
 from fdi_ros.config.config import is_topic
 from fdi_ros.core.sources import SOURCES, source_of_type
 from fdi_ros.errors import BagError
+from fdi_ros.monitor.inputs import other_input
 from fdi_ros.system.files import (
     LATEST_TIME,
     MOST_TOPICS,
@@ -69,6 +70,21 @@ FORMATS: dict[str, type[BagFile]] = {
 def _number_in_recording(file: BagFile) -> list[int | str]:
     """Return a key by which the files of one recorder sort in the order of writing."""
     return natural_order(file.path.name)
+
+
+def _hint(name: str, type_name: str, topics: Sequence[tuple[str, str]]) -> str:
+    """Return which topic of a recording was meant instead of one that is not there.
+
+    ``topics``: name and type of each topic of the recording.
+    """
+    listed = ", ".join(f"{shown(one)} ({shown(kind)})" for one, kind in topics)
+    alike = [one for one, kind in topics if kind == type_name]
+    is_near = alike and did_you_mean(name, alike).startswith("did")
+    if not is_near and (other := other_input(type_name, topics)):
+        return f", but {other}"
+    choices = alike if is_near else [one for one, _ in topics]
+    meant, found, _ = did_you_mean(name, choices).partition("?")
+    return f"{f', {meant}? It has' if found else ', it has'}: {listed or 'none at all'}"
 
 
 class _FileWalk:
@@ -179,22 +195,19 @@ class Recording:
     def require(self, names: Sequence[str], type_name: str) -> None:
         """Check that topics exist with this type and CDR encoding (`BagError`)."""
         there = {topic.name: topic for topic in self.topics}
+        kinds = [(one.name, one.type) for one in there.values()]
         for name in names:
             topic = there.get(name) or there.get(f"/{name}")
             if topic is None:
-                listed = (
-                    ", ".join(
-                        f"{shown(t.name)} ({shown(t.type)})" for t in there.values()
-                    )
-                    or "none at all"
+                raise BagError(
+                    f"{self.path} has no topic {name!r}{_hint(name, type_name, kinds)}"
                 )
-                meant, found, _ = did_you_mean(name, list(there)).partition("?")
-                hint = f", {meant}? It has" if found else ", it has"
-                raise BagError(f"{self.path} has no topic {name!r}{hint}: {listed}")
             called = f"topic {name!r} in {self.path}"
             if topic.type != type_name:
+                other = other_input(type_name, kinds)
                 raise BagError(
                     f"{called} is {shown(topic.type) or 'untyped'}, expected {type_name}"
+                    f"{other and f'; the recording has {other}'}"
                 )
             if topic.encoding != "cdr":
                 raise BagError(

@@ -28,16 +28,11 @@ from fdi_ros.inspection.topics import (
 from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.noise import much_noisier, noisier_words
 from fdi_ros.model.samples import LARGEST_GYRO_RANGE
-from fdi_ros.monitor.diagnostics import DIAGNOSTICS
-from fdi_ros.monitor.output import OUTPUTS
+from fdi_ros.monitor.inputs import is_of_a_monitor
 from fdi_ros.monitor.soundness import LEAST_DELIVERED, LEAST_SPIKES, Trouble
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.system.text import LINE, figures, first_of, listed, percent, shown
 
-_OF_A_MONITOR = {
-    topic.name.rpartition("/")[2]
-    for topic in (*(output.topic for output in OUTPUTS), DIAGNOSTICS)
-}
 #: a year, s
 YEAR = 31_557_600.0
 #: clocks this far apart have other origins, s
@@ -82,7 +77,7 @@ def left_out(reports: Sequence[TopicReport]) -> list[tuple[str, str]]:
     for report in reports:
         if report in chosen or not chosen or report.kind is not chosen[0].kind:
             continue
-        if report.topic.name.rpartition("/")[2] in _OF_A_MONITOR:
+        if is_of_a_monitor(report.topic.name):
             continue
         why = _unusable(report)
         if not why and report.burst > 1:
@@ -208,7 +203,7 @@ def not_configured(bag: Path, config: Config) -> list[str]:
             for topic in recording.topics
             if topic.type == SOURCES[config.input].type
             and topic.name.lstrip("/") not in configured
-            and topic.name.rpartition("/")[2] not in _OF_A_MONITOR
+            and not is_of_a_monitor(topic.name)
         ]
 
 
@@ -225,8 +220,7 @@ def _unusable(report: TopicReport) -> str:
         != "cdr",
         "no messages": not received,
         # The fused rate must not be its own witness.
-        "a monitor has published it": report.topic.name.rpartition("/")[2]
-        in _OF_A_MONITOR,
+        "a monitor has published it": is_of_a_monitor(report.topic.name),
         "no name that ROS allows": not is_plain_name(report.topic.name),
         f"{report.announced} values, not {MIN_CHANNELS} to {MAX_CHANNELS}": not report.channels
         and not kind.stamped,

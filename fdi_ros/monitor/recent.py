@@ -197,12 +197,13 @@ class RecentHealth:
         mean = rate if mean is None else mean
         shares = mean / usual / max(float((mean / usual).max()), 1e-9)
         for line, share, own, normal in zip(inputs, shares, rate, usual, strict=True):
+            # Without any message there is no rate to compare with.
             yield UnitHealth(
                 name=line.name,
                 topic=line.topic,
                 delivered=float(share),
-                rate_hz=float(normal),
-                slow_rate_hz=float(own),
+                rate_hz=float(normal) if line.received else None,
+                slow_rate_hz=float(own) if line.received else None,
                 warning=input_warning(line),
             )
 

@@ -408,6 +408,8 @@ def _is_slow(unit: UnitHealth) -> bool:
 
 
 def _slow_words(unit: UnitHealth) -> str:
+    if unit.delivered == 0.0 and unit.rate_hz is None:
+        return "delivered no message"
     words = f"delivered {percent(unit.delivered)} of its messages"
     if unit.slow_rate_hz is None or unit.rate_hz is None:
         return words

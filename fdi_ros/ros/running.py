@@ -25,6 +25,7 @@ from fdi_ros.core.live import (
     WORKED,
 )
 from fdi_ros.core.messages import LAST_STAMP, frame_of
+from fdi_ros.core.sources import SOURCES
 from fdi_ros.monitor.diagnostics import (
     MONITOR_LINE,
     OLD,
@@ -35,6 +36,7 @@ from fdi_ros.monitor.diagnostics import (
     encode_diagnostics,
     frame_words,
 )
+from fdi_ros.monitor.inputs import other_input
 from fdi_ros.monitor.output import OUTPUTS, ChannelState, Event, format_reason
 from fdi_ros.monitor.receiver import (
     Receiver,
@@ -171,6 +173,12 @@ class InputTopic:
         self._reported_counts: dict[str, int] = {}
 
     @property
+    def _misses_imus(self) -> bool:
+        # The default input is an array, which nobody publishes where IMUs are meant.
+        source = self._receiver.source
+        return not source.stamped and not self._inlet["received"]
+
+    @property
     def _is_unstamped(self) -> bool:
         # One may be of 0 s, not several.
         return (
@@ -251,7 +259,7 @@ class InputTopic:
     def check_sources(
         self, node: CheckedNode, inputs: Sequence[InputTopic], log: BoundedLog
     ) -> None:
-        """Log when the topic gets a second publisher, or when an earlier input reads the same topic."""
+        """Log when the topic gets a second publisher, is read twice, or has none but IMUs do."""
         before = self._sources
         self._sources = ""
         first = next(one for one in inputs if one.topic == self.topic)
@@ -268,6 +276,8 @@ class InputTopic:
                 f"{len(found)} publishers on {self.topic}, expected one: {', '.join(names)}",
                 LINE,
             )
+        elif self._misses_imus:
+            self._sources = _imus_instead(node, self.topic)
         if self._sources and self._sources != before:
             log.warning(self._sources)
 
@@ -276,6 +286,20 @@ class InputTopic:
         self._watchdog.measure(int(self._inlet["received"]), now)
         self._reported_counts = self._receiver.counts(self._number)
         self._inlet["lag"] = NO_STAMP
+
+
+def _imus_instead(node: CheckedNode, topic: str) -> str:
+    """Return that no array is published on a topic, but IMU topics are. Empty: not so."""
+    imu = SOURCES["imus"].type
+    kinds = [
+        (name, one.topic_type)
+        for name, types in node.get_topic_names_and_types()
+        if imu in types
+        for one in node.get_publishers_info_by_topic(name)
+        if one.topic_type == imu
+    ]
+    found = other_input(SOURCES["channels"].type, list(dict.fromkeys(kinds)))
+    return shown(f"no array on {topic}, but {found}", LINE) if found else ""
 
 
 class Running:

@@ -163,6 +163,25 @@ def test_a_topic_that_is_not_there_is_compared_with_those_that_are(tmp_path, ref
     assert "no topic '/imu_2/dat', did you mean '/imu_2/data'? It has: " in said
 
 
+@pytest.mark.parametrize("verb", ["replay", "sweep", "calibrate"])
+@pytest.mark.parametrize("topic", ["", "/imu_0/data", "/gyros"])
+def test_imus_with_the_config_of_an_array_are_told_the_input(
+    tmp_path, refused, verb, topic
+):
+    """The config names no topic, one of an IMU, or one that is not there."""
+    time, rates = drive(seconds=2.0)
+    path = write_bag(tmp_path / "bag.mcap", time, rates)
+    config = tmp_path / "array.yaml"
+    given = f"    channels:\n      topic: {topic}\n" if topic else ""
+    config.write_text(f"/**:\n  ros__parameters:\n    sample_rate: 50.0\n{given}")
+    more = ("--output", tmp_path / "o.yaml") if verb == "calibrate" else ()
+    said = refused(verb, path, "--config", config, *more)
+    assert said.endswith(
+        "topics of type sensor_msgs/msg/Imu: to read them, set `input: imus` and"
+        " `imus.topics: [/imu_0/data, /imu_1/data, /imu_2/data]`\n"
+    )
+
+
 def test_stamps_that_jitter_are_no_bursts(tmp_path, fdi):
     time, rates = drive()
     time = np.sort(time + np.random.default_rng(1).uniform(-0.008, 0.008, len(time)))

@@ -118,6 +118,20 @@ def test_a_slow_unit_is_named_with_both_rates_however_long_it_lasts():
     assert str(one) == "imu_1 delivered 33 % of its messages (33 instead of 100 Hz)"
 
 
+def test_a_unit_that_sent_nothing_has_no_rate_to_be_compared_with():
+    health, pipeline = RecentHealth(), Pipeline(parallel(3))
+    pipeline.process(healthy(2))
+    status = pipeline.status()
+    for k in range(20):
+        inputs = [
+            InputStatus(f"imu_{u}", f"/imu_{u}", SECOND * k * (u < 2), RATE, 0.01, True)
+            for u in range(3)
+        ]
+        health.add(status, inputs, float(k))
+    (one,) = health.concerns
+    assert str(one) == "imu_2 delivered no message"
+
+
 @pytest.mark.parametrize("readings", [1, 20])
 @pytest.mark.parametrize(
     ("given", "words"),

@@ -44,6 +44,7 @@ from ros.processes import (
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
+from fdi_ros.config.config import Config
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
@@ -361,6 +362,19 @@ def test_two_inputs_on_one_topic_are_named_and_are_no_redundancy(
         )
         assert listener.says("imu_2.x", "one sensor, no redundancy")
         assert wait(lambda: (listener.states()[-1][3:] == ChannelState.UNCHECKED).all())
+
+
+def test_a_node_that_waits_for_an_array_is_told_of_imus(tmp_path) -> None:
+    with (
+        listening(TWO_IMUS.topics) as listener,
+        running("fdi_node", parameter_file(Config(), tmp_path)) as process,
+    ):
+        words = (
+            "no array on /gyro_channels, but topics of type sensor_msgs/msg/Imu: to read them,"
+            " set `input: imus` and `imus.topics: [/imu_1/data_raw, /imu_2/data_raw]`"
+        )
+        assert listener.says("input gyro_channels", words)
+        assert sum(words in line for line in process.said().splitlines()) == 1
 
 
 def test_what_is_odd_about_clocks_is_named_and_lived_with(tmp_path) -> None:
