@@ -102,6 +102,8 @@ DOUBTS = {
     ChannelState.FAULTY,
     ChannelState.STALE,
 }
+#: States of channels that the monitor has declared: alone, or with others of which one is faulty.
+DECLARED = {ChannelState.AMBIGUOUS, ChannelState.FAULTY}
 STATES = {int(state): state for state in ChannelState}
 #: States of channels of which a fault would not be seen.
 UNJUDGED = {ChannelState.UNCHECKED, ChannelState.EXCLUDED, ChannelState.STALE}
@@ -490,6 +492,7 @@ class Evidence:
             votes=unit not in self._once_bad,
             waits="".join(AXES[axis] for axis in sorted(track.waits)),
             unjudged="".join(unjudged),
+            declared="".join(AXES[axis] for axis in sorted(track.axes(*DECLARED))),
         )
 
     def _lasting_odd_one(self, units: Sequence[int], now: int) -> tuple[int, set[int]]:

@@ -120,6 +120,9 @@ class Imu(NamedTuple):
     unjudged: str = (
         ""  #: Axes, such as xz, that the monitor has not judged for a while.
     )
+    declared: str = (
+        ""  #: Axes, such as xz, that the monitor finds FAULTY or in a set, AMBIGUOUS.
+    )
     lane: bool = True  #: The autopilot has an EKF lane for it, as far as is known.
     size: float = float("nan")
     """Largest raw difference of late to the IMU nearest on an axis, rad/s. NaN: unknown."""

@@ -133,6 +133,11 @@ def _reasons(
             (imu.blamed, f"{name} faulty and in use"),
             (is_apart(imu, settings), differ or f"{name} differs and is in use"),
             (not imu.delivers, f"{name} sends nothing"),
+            # In flight failover acts beside a declared gyro that does not differ.
+            (
+                imu.declared and not view.armed,
+                f"{name} {', '.join(imu.declared)} faulty or in a set",
+            ),
             (not memory.acquainted, f"{name} not seen to agree yet"),
             (imu.agreed is None, f"{name} agrees with none"),
             (imu.unjudged, f"{name} {', '.join(imu.unjudged)} not judged"),

@@ -217,6 +217,8 @@ _STATES = {
 }  # severity and words by state
 _QUIET = ("OK", "AMBIGUOUS")  #: Not announced beside failover.
 _FINE = ("OK", "UNCHECKED", "EXCLUDED")
+#: States with which nobody should take off.
+_NOT_SOUND = ("FAULTY", "AMBIGUOUS", "STALE")
 IN_BOTH_HALVES = "faulty (gyros and accelerometers)"
 NOTHING_SEEN = "no further fault would be detected"
 
@@ -238,6 +240,21 @@ def _format_whole(line: StatusLine) -> str:
 def _fit(name: str, words: str) -> str:
     """Return a text about a unit or channel. A name that is too long loses its beginning."""
     return f"FDI: {name[-(TEXT_LENGTH - len(f'FDI:  {words}')) :]} {words}"
+
+
+def allows_arming(lines: Sequence[StatusLine]) -> bool:
+    """Whether a vehicle may be armed, by the diagnostics of a monitor.
+
+    It may not without samples, without a fused rate, or while a fault would not be detected;
+    nor while a gyro or accelerometer is FAULTY, is in a set of which one is faulty, or is
+    silent.
+    """
+    whole = next((line for line in lines if line.name == MONITOR_LINE), None)
+    return (
+        whole is not None
+        and whole.level < Level.ERROR
+        and not any(line.value("state") in _NOT_SOUND for line in lines)
+    )
 
 
 class Announcer:

@@ -34,14 +34,13 @@ from fdi_ros.core.messages import (
     as_batch,
 )
 from fdi_ros.core.sources import ChannelsSource
-from fdi_ros.core.states import ChannelState
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
 from fdi_ros.mavlink.failover_policy import PolicySettings
 from fdi_ros.mavlink.failover_ready import INS_USE
 from fdi_ros.mavlink.link import open_link
 from fdi_ros.mavlink.protocol import ImuSample, Thinning, system_ahead
-from fdi_ros.mavlink.report import Announcer, Reporter
+from fdi_ros.mavlink.report import Announcer, Reporter, allows_arming
 from fdi_ros.mavlink.signing import NO_TIMES, SigningFile, mark_of, read_key
 from fdi_ros.mavlink.vehicle import Vehicle, VehicleSettings
 from fdi_ros.monitor.diagnostics import (
@@ -320,11 +319,9 @@ class AutopilotNode(CheckedNode):
             for name, key in (("fdi_stat", "statistic"), ("fdi_limit", "threshold")):
                 if not math.isnan(value := whole.number(key)):
                     self._vehicle.send_value(name, value, now)
-            is_sound = whole.level != Level.STALE and not any(
-                line.value("state") == ChannelState.FAULTY.name for line in lines
-            )
             protects = failover is None or failover.status(now)[0] == Level.OK
-            self._vehicle.send_value("fdi_ready", float(is_sound and protects), now)
+            ready = allows_arming(lines) and protects
+            self._vehicle.send_value("fdi_ready", float(ready), now)
         if self._announcer is not None:
             self._announcer.hear(lines, now)
         topics = [

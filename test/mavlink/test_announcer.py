@@ -17,6 +17,7 @@ from fdi_ros.mavlink.report import (
     TEXT_LENGTH,
     WARNING,
     Announcer,
+    allows_arming,
 )
 from fdi_ros.monitor.diagnostics import MONITOR_LINE, Level, StatusLine
 
@@ -42,6 +43,35 @@ def report(
         "estimated error (rad/s)": error,
     }
     return StatusLine(Level.OK, name, "", values=tuple(values.items()))
+
+
+@pytest.mark.parametrize(
+    ("state", "allowed"),
+    [
+        *(("OK", True), ("SUSPECT", True), ("UNCHECKED", True), ("EXCLUDED", True)),
+        *(("FAULTY", False), ("AMBIGUOUS", False), ("STALE", False)),
+    ],
+)
+@pytest.mark.parametrize("name", ["imu_2.y", "imu_2.accel_z"])
+def test_a_faulty_or_silent_sensor_or_a_set_of_two_units_forbids_arming(
+    name: str, state: str, allowed: bool
+) -> None:
+    whole = StatusLine(Level.WARN, MONITOR_LINE, "8 of 9 gyros healthy")
+    others = [report(one, "OK") for one in CHANNELS if one != name]
+    pair = "imu_1.y, imu_2.y" if state == "AMBIGUOUS" else ""
+    assert allows_arming([whole, *others, report(name, state, pair)]) is allowed
+
+
+@pytest.mark.parametrize(
+    ("level", "allowed"),
+    [(Level.OK, True), (Level.WARN, True), (Level.ERROR, False), (Level.STALE, False)],
+)
+def test_without_rate_samples_or_a_check_of_any_gyro_nobody_arms(
+    level: Level, allowed: bool
+) -> None:
+    channels = [report(name, "OK") for name in CHANNELS]
+    assert allows_arming([StatusLine(level, MONITOR_LINE, ""), *channels]) is allowed
+    assert not allows_arming(channels)
 
 
 class Ground:

@@ -497,6 +497,21 @@ def test_an_axis_that_the_monitor_leaves_out_for_long_is_not_judged(state: int) 
     assert not any(imu.unjudged for imu in watched.step())
 
 
+@pytest.mark.parametrize(
+    ("state", "axes"),
+    [(FAULTY, "y"), (AMBIGUOUS, "y"), (SUSPECT, ""), (STALE, ""), (UNCHECKED, "")],
+)
+def test_a_declared_axis_is_one_that_is_faulty_or_in_a_set(
+    state: int, axes: str
+) -> None:
+    watched = watch()
+    assert not any(imu.declared for imu in watched.step())
+    watched.states[4] = state
+    assert [imu.declared for imu in watched.step()] == ["", axes, ""]
+    watched.states[4] = OK
+    assert not any(imu.declared for imu in watched.step())
+
+
 def test_what_was_never_judged_is_not_judged() -> None:
     never = Evidence(3, STEP, min_size=0.03)
     assert [imu.unjudged for imu in never.look([True] * 3, [], START)] == ["xyz"] * 3

@@ -1394,6 +1394,30 @@ def test_what_cannot_be_seen_is_not_ready(flying: Monitored, tmp_path: Path) -> 
     assert reason(two.run(15.0)) == "no failover: use of IMU 3 is not reported"
 
 
+@pytest.mark.parametrize("pair", [(0, 3), (1, 4, 7)])
+def test_a_set_of_two_units_is_not_ready_on_the_ground_and_acted_beside_in_flight(
+    flying: Monitored, pair: tuple[int, ...]
+) -> None:
+    """The IMUs agree all the time: what the set is about is below what failover acts on."""
+    for channel in pair:
+        flying.states[channel] = AMBIGUOUS
+    flying.autopilots[0].armed = False
+    axis = "xyz"[pair[0]]
+    words = f"no failover: IMU 1 {axis} faulty or in a set"
+    assert reason(flying.run(3.0)) == words
+    flying.autopilots[0].armed = True
+    assert reason(flying.run(3.0)) == "ready"
+    # That is true: a fault of any IMU is answered, in the set or not.
+    for imu in (3, 1):
+        flying.fault(imu, 0.3, seconds=2.0)
+        assert flying.in_use == [k != imu for k in (1, 2, 3)]
+        flying.heal(imu, 8.0)
+        assert flying.in_use == [True] * 3
+    flying.states = [OK] * 9
+    flying.autopilots[0].armed = False
+    assert reason(flying.run(3.0)) == "ready"
+
+
 def test_use_that_was_not_reported_for_ten_seconds_is_unknown(
     flying: Monitored,
 ) -> None:

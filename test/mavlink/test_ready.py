@@ -73,6 +73,7 @@ def test_two_that_were_bad_have_no_vote_on_the_third() -> None:
         ({"second": {"delivers": False}}, "IMU 2 sends nothing"),
         ({"second": {"size": 0.05}}, "IMU 2 differs and is in use"),
         ({"second": {"unjudged": "xy"}}, "IMU 2 x, y not judged"),
+        ({"second": {"declared": "xy"}}, "IMU 2 x, y faulty or in a set"),
         ({"second": {"lane": False}}, "EK3_IMU_MASK is without IMU 2"),
         ({"memory": {"acquainted": False}}, "IMU 2 not seen to agree yet"),
         ({"memory": {"left_alone": True}}, "IMU 2 left alone in this flight"),
@@ -122,6 +123,12 @@ def test_monitor_and_link_are_in_doubt_from_these_sizes_on(
 ) -> None:
     assert reason(facts=fine) == ""
     assert reason(facts=doubtful)
+
+
+def test_what_the_monitor_declares_counts_before_arming_only() -> None:
+    """In flight failover answers beside a declared gyro that does not differ."""
+    assert reason(second={"declared": "x"}, armed=True) == ""
+    assert reason(second={"declared": "x", "agreed": None}, armed=True)
 
 
 def test_the_gravest_reason_comes_first() -> None:
