@@ -1,7 +1,7 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recognise rates in deg/s by the rotation, the range and the bias of gyros."""
+"""Recognise rates in deg/s by the rotation, the range and the bias of gyros, and by gravity."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from fdi_ros.estimator.estimator import REST_BLOCKS
 from fdi_ros.inspection.segments import LARGEST_BIAS, SEGMENT_LENGTH
+from fdi_ros.inspection.tilt import sum_of, swings_of
 from fdi_ros.inspection.topics import (
     TopicReport,
 )
@@ -45,6 +46,14 @@ NOISIEST = 0.02
 #: smallest rotation in gentle motion, rad/s, and over the noise of its mean, of which
 #: three quantiles are compared
 GENTLE_ROTATION, GENTLE_OVER_NOISE = 0.01, 10.0
+#: Swings of gravity that rates in rad/s foretell, rad: a multicopter and a pendulum swing
+#: with gravity, and so far only if they fly or swing hard.
+LEAST_SWING = 0.3
+#: Share of the swings of the accelerometers that the rates explain. In healthy recordings
+#: in which they are 57 times too small, by chance, it is 0.01.
+LEAST_SHARED = 0.5
+#: windows that show so, each by itself
+LEAST_SWUNG = 2
 
 
 def in_degrees(
@@ -78,6 +87,12 @@ def in_degrees(
     elif chosen and _no_gyros_at_rest(chosen):
         noise = max(float(one.segments.noise().quiet.max()) for one in chosen)
         why = f"no gyro at rest has a bias and noise of {figures(noise, 2)} rad/s"
+    elif swung := [one for one in chosen if _swings_in_degrees(one)]:
+        chosen = swung
+        verb = "shows" if len(swung) == 1 else "show"
+        why = (
+            f"and {verb} {figures(DEGREES.factor)} times the tilt of the accelerometers"
+        )
     else:
         return ""
     names = " and ".join(shown(one.topic.name) for one in chosen)
@@ -111,6 +126,25 @@ def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
     each = report.segments.every * SEGMENT_LENGTH / REST_BLOCKS
     often = beyond.mean() > FAST_SHARE
     return bool(each * (beyond if often else lasting).sum() > FAST_TIME)
+
+
+def _swings_in_degrees(report: TopicReport) -> bool:
+    """Whether gravity swings as the rates of a unit foretell, but 57 times less."""
+    if report.channels != report.forces.channels:
+        return False
+    swings = swings_of(report.segments, report.forces)
+    alike = [
+        one
+        for one in swings
+        if one.size > LEAST_SWING
+        and one.shared > LEAST_SHARED
+        and abs(one.factor / DEGREES.factor - 1.0) < NEAR
+    ]
+    if len(alike) < LEAST_SWUNG:
+        return False
+    whole = sum_of(swings)
+    near = abs(whole.factor / DEGREES.factor - 1.0) < NEAR
+    return near and whole.shared > LEAST_SHARED
 
 
 class _Rest(NamedTuple):
