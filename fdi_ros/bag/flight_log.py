@@ -577,11 +577,11 @@ class FlightLog(BagFile):
                 for name, count in self.counts.most_common(_MOST_NAMES)
             )
             return f" has no {' or '.join(self.kinds)}, it has {most or 'no records'}. What to do: {setting}"
-        has = ", ".join((*there, *unread))
+        has = "; ".join((*there, *unread))
         if not unread and max(map(len, kinds.values())) < self.fewest_imus:
             return f": {self.one_imu.format(has)}"
         needed = f"two IMUs or more, each with {_FEWEST} samples or more at {self.slowest:g} Hz or more"
-        return f" has {has}; needed: {needed}. What to do: {setting}"
+        return f" has too few samples to compare two IMUs: it has {has}; needed: {needed}. What to do: {setting}"
 
 
 def _logged(kind: str, tracks: Sequence[Track]) -> str:

@@ -49,6 +49,7 @@ from fdi_ros.system.files import (
     ULOG_OTHER_BYTES,
     ULOG_TOPIC_COST,
 )
+from fdi_ros.system.text import figures
 
 #: bytes of a message before its content: two of its size, one of its kind
 _HEAD = 3
@@ -80,14 +81,13 @@ _THROTTLE = (
 """Topics and fields with the throttle, of newer and older versions."""
 _TEMPERATURES = (("gyro_device_id", "temperature_gyro"), ("device_id", "temperature"))
 """Fields with the device of a gyro and its temperature."""
-_COUNTED_FIELDS = ("gyro_error_count", "gyro_clipping")
 _HELD = {
-    "temperature_gyro": "up to {high:.0f} degC",
-    "gyro_vibration_metric": "vibration up to {high:.2g} rad/s",
+    "temperature_gyro": "up to {high:.0f} °C",
+    "gyro_vibration_metric": "vibration up to {plain} rad/s",
     "gyro_error_count": "{high:.0f} errors",
     "gyro_clipping": "{high:.0f} samples clipped on an axis",
 }
-"""Fields of vehicle_imu_status to report, with their format; counters only if not 0."""
+"""Fields of vehicle_imu_status to report, with their format; none of zeros only."""
 #: fix_type from which on the time is known: a fix in three dimensions
 _FIX = 3
 
@@ -398,10 +398,10 @@ def _status_words(
         first, reference = means[0]
         if len(mean):
             apart = np.median(mean - reference, axis=0) * FLU
-            figures = ", ".join(f"{value:+.4f}" for value in apart)
+            differences = ", ".join(f"{value:+.4f}" for value in apart)
             words.append(
                 f"imu_{source.instance} less imu_{first.instance}, median of"
-                f" {len(mean)} means: {figures} rad/s"
+                f" {len(mean)} means: {differences} rad/s"
             )
     for source, columns in topics.items():
         held = []
@@ -409,11 +409,13 @@ def _status_words(
             values = [column for key, column in columns.items() if _is_of(key, name)]
             found = np.concatenate([np.empty(0), *values])
             found = found[np.isfinite(found)]
-            if len(found) and (found.max() > 0.0 or name not in _COUNTED_FIELDS):
-                held.append(form.format(low=found.min(), high=found.max()))
+            # A temperature of exactly 0 is not measured.
+            if found.any():
+                high = float(found.max())
+                held.append(form.format(high=high, plain=figures(high, 2)))
         if held:
             words.append(f"imu_{source.instance} {', '.join(held)}")
-    return f"{_STATUS}: {'; '.join(words)}" if words else ""
+    return f"{_STATUS} ({'; '.join(words)})" if words else ""
 
 
 def _is_of(key: str, name: str) -> bool:

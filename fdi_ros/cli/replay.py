@@ -436,8 +436,7 @@ def run_fleet(arguments: Namespace) -> int:
     code = outputs.finish(text, figures, severity=fleet.verdict.severity)
     if not fleet.judged:
         raise BagError(
-            f"none of the {len(paths)} recordings could be judged: {arguments.output / PAGE}"
-            " has the reasons"
+            f"no recording could be judged: {arguments.output / PAGE} has the reasons"
         )
     return code
 

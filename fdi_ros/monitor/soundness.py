@@ -170,7 +170,7 @@ class Trouble(Enum):
         "judge only the part before the values repeat (--end), or check the driver if the vehicle moved"
         " meanwhile; at rest, coarse values repeat by themselves"
     )
-    LEFT_OUT = "to judge {who} too, mend what is wrong, or choose the units in a config (--config)"
+    LEFT_OUT = "to judge {who} too, list the units to judge in a config (--config), or mend the cause"
     DELIVERY = "check connection, driver and bus load of {who}"
     STAMPS = (
         "check the driver of {who}: every message needs the time of its measurement"

@@ -440,7 +440,7 @@ def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
     if one.sets > 1:
         until += f", {one.sets} times"
     if one.noisy_from_s is not None:
-        until += f", as noise from {one.noisy_from_s:.3f} s"
+        until += f", noisy from {one.noisy_from_s:.3f} s on"
     about = _about(one, unit)
     before = _before(one)
     if not before and one.since_s - one.start_s >= LEAST_BEFORE:
@@ -536,7 +536,7 @@ def _about(one: Episode, unit: Unit) -> str:
             if part
         )
     if len(one.channels) <= FEW_CHANNELS:
-        return "; ".join(f"{words} if it is {name}" for name, words in sizes)
+        return "; ".join(f"if it is {name}: {words}" for name, words in sizes)
     known = [
         abs(candidate.size.rad_s)
         for candidate in one.candidates
@@ -617,7 +617,13 @@ def _growth(one: Candidate, unit: Unit) -> str:
         figures(value * unit.factor, 3, "+")
         for value in (size.rad_s, size.last_rad_s, size.slope_rad_s2)
     )
-    return f"{one.channel} {course_word(size)} by {slope} {unit.name} per second, from {first} to {last} {unit.name}"
+    span = f"from {first} to {last} {unit.name}"
+    if size.slope_rad_s2 * (size.last_rad_s - size.rad_s) <= 0.0:
+        # It went there and back, and the slope has the other sign.
+        return f"{one.channel} {course_word(size)} {span}"
+    return (
+        f"{one.channel} {course_word(size)} by {slope} {unit.name} per second, {span}"
+    )
 
 
 def _evidence(one: Episode) -> str:

@@ -151,9 +151,10 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
         float(floor.std[largest]),
         float(floor.error[largest]),
     )
-    words = f"scale_std {result.scale[0]:.2g} +- {result.scale[1]:.1g}, timing_std {1e3 * result.timing:.2g} ms; "
+    words = f"scale_std {plus_minus(*result.scale)}, timing_std {figures(1e3 * result.timing, 2)} ms; "
     words += "bias walk" if walk.value else "bias walk too small to measure, below"
-    words += f" {(walk.value or walk.possible) * factor:.2g} {name} per sqrt(s)"
+    size = figures((walk.value or walk.possible) * factor, 2)
+    words += f" {size} {name} per sqrt(s)"
     yield Finding(Role.FOUND, "scale error", words, (), *result.scale)
     bent = found.nonlinearity
     if bent.is_measured:
@@ -232,7 +233,7 @@ def _delay_words(delay: StampDelay, corrected: bool) -> str:
     side = "late (measured before the stamp)"
     if delay.value < 0:
         side = "early (measured after the stamp)"
-    what = "corrected" if delay.shown else "not corrected: it may be zero"
+    what = "corrected" if delay.shown else "not corrected: the delay may be zero"
     if not corrected:
         what = "not corrected: all come in one message"
     size = f"{1e3 * abs(delay.value):.2f} +- {1e3 * delay.error:.2f} ms"
@@ -333,9 +334,8 @@ def _found_forces(fit: AccelerometerFit) -> Iterator[Finding]:
         largest = int(np.where(shown, np.abs(found.bias), 0.0).argmax())
         value = float(found.bias[largest])
         error = float(fit.bias_std[largest])
-        words += (
-            f", the largest {fit.names[largest]} {value:+.3f} +- {error:.3f} {name}"
-        )
+        size = f"{'+' if value > 0.0 else ''}{plus_minus(value, error)}"
+        words += f", the largest {fit.names[largest]} {size} {name}"
     yield Finding(Role.FOUND, "accelerometer bias", words)
     words = "accelerometers: after correction their scales still differ by"
     words += f" {_percent(*fit.scale)}"

@@ -22,6 +22,9 @@ WORD, LINE = (
     4000,
 )
 
+#: numbers from this size on are written without an exponent
+LEAST_IN_FULL = 1e-9
+
 
 def shown(text: object, most: int = WORD) -> str:
     r"""Return a short single-line text without characters that control a terminal.
@@ -105,12 +108,18 @@ def _without_digits(word: str) -> str:
 
 
 def figures(value: float, digits: int = 3, sign: str = "") -> str:
-    """Write a number with some significant digits, a large one in full: ``1250``, not ``1.2e+03``.
+    """Write a number with some significant digits, and without an exponent down to 1e-9.
 
+    ``1250``, not ``1.2e+03``; ``0.000015``, not ``1.5e-05``.
     ``sign``: ``+`` writes the sign of positive numbers too.
     """
     text = f"{value:{sign}.{digits}g}"
-    return f"{value:{sign}.0f}" if "e+" in text else text
+    if "e+" in text:
+        return f"{value:{sign}.0f}"
+    if "e-" in text and abs(value) >= LEAST_IN_FULL:
+        places = digits - 1 - math.floor(math.log10(abs(value)))
+        return f"{value:{sign}.{places}f}".rstrip("0")
+    return text
 
 
 def percent(share: float | None) -> str:

@@ -427,7 +427,7 @@ def test_of_a_default_log_of_px4_of_any_length_the_means_are_said(
     assert f"imu_1 less imu_0, median of {seconds} means: " in out
     z = float(out.partition("means: ")[2].split()[2])
     assert z == pytest.approx(-0.25, abs=0.01)
-    assert "imu_1 up to 41 degC, 3 errors" in out
+    assert "imu_1 up to 41 °C, 3 errors" in out
 
 
 def test_the_status_of_an_older_px4_without_means_is_said(tmp_path, refused):
@@ -436,8 +436,8 @@ def test_the_status_of_an_older_px4_without_means_is_said(tmp_path, refused):
     data = path.read_bytes()
     path.write_bytes(data.replace(b" mean_gyro;", b" some_gyro;"))
     said = refused("inspect", path)
-    assert "imu_0 up to 40 degC" in said
-    assert "imu_1 up to 41 degC, 3 errors" in said
+    assert "imu_0 up to 40 °C" in said
+    assert "imu_1 up to 41 °C, 3 errors" in said
     assert "median of" not in said
 
 

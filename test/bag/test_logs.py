@@ -540,7 +540,9 @@ def test_why_a_log_is_refused_and_the_setting_that_helps(
             [thinned(unit, kept) for unit in units(seconds=8.0, rate=rate)],
         )
     )
-    assert f"has {kind} of 3 IMUs {words}" in said
+    assert (
+        f"too few samples to compare two IMUs: it has {kind} of 3 IMUs {words}" in said
+    )
     assert setting in said
     assert 'docs/flight_logs.md, "Settings of the logger"' in said
 

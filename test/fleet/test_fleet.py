@@ -530,7 +530,7 @@ def test_where_nothing_could_be_judged_that_is_the_end(tmp_path, capsys):
     (tmp_path / "a.mcap").write_bytes(b"")
     run(tmp_path / "o", tmp_path, codes=[2])
     assert (
-        f"none of the 1 recordings could be judged: {tmp_path / 'o' / 'fleet.html'}"
+        f"no recording could be judged: {tmp_path / 'o' / 'fleet.html'}"
         in capsys.readouterr().err
     )
     assert (tmp_path / "o" / "flights.parquet").exists()

@@ -26,7 +26,9 @@ from fdi_ros.monitor.output import Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import (
     STRETCH_GAP,
+    Candidate,
     Size,
+    _growth,
     detail_words,
     episode_words,
     pieces,
@@ -37,7 +39,7 @@ from fdi_ros.replay.recorder import Batches, Recorder
 from fdi_ros.replay.run import Sink, Walk
 from fdi_ros.replay.verdict import verdict_of
 from fdi_ros.replay.words import fault_sections, sentences
-from fdi_ros.report.layout import Severity
+from fdi_ros.report.layout import RADIANS, Severity
 
 S = ChannelState
 THREE = Geometry.from_triads([np.eye(3)] * 3)
@@ -122,6 +124,19 @@ def histories(draw):
         errors,
         np.cumsum(steps),
     )
+
+
+@pytest.mark.parametrize(
+    ("last", "words"),
+    [
+        (0.3, "imu_1.x growing by +0.02 rad/s per second, from +0.2 to +0.3 rad/s"),
+        (-0.1, "imu_1.x changing from +0.2 to -0.1 rad/s"),
+    ],
+)
+def test_a_slope_is_said_only_if_the_error_went_that_way(last, words):
+    """An error that goes there and back has a slope of either sign."""
+    size = Size(0.2, 0.01, "growing", last, slope_rad_s2=0.02)
+    assert _growth(Candidate("imu_1.x", "x", size), RADIANS) == words
 
 
 @given(histories(), st.integers(1, 40))

@@ -150,7 +150,7 @@ def test_a_set_that_passes_into_noise_of_its_unit_is_one_episode_of_the_unit():
     assert (one.start_s, one.end_s, one.stands) == (6.0, 39.9, True)
     assert (one.is_brief, one.noisy_from_s) == (True, 7.0)
     assert one.words.startswith(
-        "imu_3 AMBIGUOUS from 6.000 s, 2 times, as noise from 7.000 s"
+        "imu_3 AMBIGUOUS from 6.000 s, 2 times, noisy from 7.000 s on"
     )
     ends = noise("imu_3.x", "imu_3.z", until=15.0)
     one, other = join_noise(run, ends, STRETCHES, UNIT_OF)
