@@ -280,12 +280,12 @@ def _settings_of_units(
     )
     known: dict[str, _Setting] = {
         "imus.topics": (topics, ""),
-        "imus.names": (unit_names(topics), "by the topics above"),
+        "imus.names": (unit_names(topics), "taken from the topics above"),
         "imus.mounts": (mounts.ravel().tolist(), mounted or assumed),
         "imus.max_skew": (_rounded_up(0.2 / max(one.rate for one in chosen)), ""),
     }
     if all(_LOG_TOPIC.fullmatch(topic) for topic in topics):
-        words = "of a flight log: so that a later fault of the flight is named as the first was, once that has gone"
+        words = "for a flight log: a second fault is named like the first, once the first has ended"
         known["decision.latch"] = False, words
     if timeout := _longer(chosen, _BRIDGED, 10.0):
         slowest = min(report.rate for report in chosen)

@@ -271,7 +271,7 @@ def _find_worse(status: Status) -> dict[str, list[str]]:
     for unit in status.units:
         if abs(unit.delay) > max(CERTAIN_DELAY * unit.delay_std, LEAST_DELAY):
             side = "late" if unit.delay > 0 else "early"
-            off = ", taken off" if unit.taken_off else ""
+            off = "; the monitor corrects this" if unit.taken_off else ""
             size = f"{1e3 * abs(unit.delay):.1f} +- {1e3 * unit.delay_std:.1f} ms"
             found[unit.name] = [
                 f"its stamps are {size} {side} against {unit.against}'s{off}"
@@ -373,7 +373,7 @@ def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[st
             round(before + (unit.delay if unit in late else 0.0), 5)
             for before, unit in zip(set_now, status.units, strict=True)
         ]
-        words[-1] += f" (to take it off from the start: imus.delays: {delays})"
+        words[-1] += f" (to correct it from the start: imus.delays: {delays})"
     faulty = {
         channel.name
         for channel in status.channels

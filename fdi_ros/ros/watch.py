@@ -369,7 +369,7 @@ def _format_figures(picture: Picture) -> str:
         picture.whole.value(key) or "none"
         for key in ("sample rate (Hz)", "latency p99 (ms)")
     )
-    return f" | {rate} | {evidence} | {hertz} Hz, p99 {late} ms"
+    return f" | {rate} | {evidence} | {hertz} Hz, latency p99 {late} ms"
 
 
 # Drawn on a terminal ------------------------------------------------------------------

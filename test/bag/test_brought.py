@@ -441,6 +441,19 @@ def test_the_status_of_an_older_px4_without_means_is_said(tmp_path, refused):
     assert "median of" not in said
 
 
+def test_a_temperature_that_was_not_measured_is_not_said(refused):
+    """The log of a simulator has a temperature of 0 throughout."""
+    said = refused("inspect", case("../logs/sample_px4_events.ulg"))
+    assert "vehicle_imu_status (imu_0 vibration up to 0.0088 rad/s); " in said
+    assert "°C" not in said
+
+
+def test_what_a_short_log_lacks_comes_before_what_it_has(refused):
+    said = refused("inspect", case("../logs/sample_log_small.ulg"))
+    assert "has too few samples to compare two IMUs: it has vehicle_imu of 3 " in said
+    assert "imu_0 vibration up to 0.000032 rad/s; imu_1" in said
+
+
 def test_a_mistyped_path_gets_the_file_that_was_meant(tmp_path, refused):
     time, rates = drive()
     meant = write_csv(tmp_path / "hover_flight.csv", time, rates)

@@ -355,6 +355,7 @@ def test_a_late_unit_is_told_with_the_setting_that_takes_it_off(
     assert not declarations(pipeline, output) or not delays
     if words:
         assert abs(status.delays[1] - delays[1]) < 4 * status.delay_std[1]
+        assert "; the monitor corrects this (to correct it from the start: " in message
         hint = json.loads(message.split("imus.delays: ")[1].rstrip(")"))
         assert hint == pytest.approx(
             np.add(late, changes.get("imus.delays", 0.0)), abs=3e-4

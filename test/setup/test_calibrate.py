@@ -19,8 +19,8 @@ from fdi_ros.inspection.findings import Role, lines_of
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.setup.blocks import prepare
-from fdi_ros.setup.calibrate import calibrate
-from fdi_ros.setup.report import calibration_findings
+from fdi_ros.setup.calibrate import StampDelay, calibrate
+from fdi_ros.setup.report import _delay_words, calibration_findings
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -356,3 +356,19 @@ def test_verb_writes_a_config_that_works(recording, tmp_path, fdi, refused):
     )
     check_target(output, Kind.PARAMETERS, force=True)
     check_target(report, Kind.PAGE, force=True)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (
+            0.4e-4,
+            "stamps 0.04 +- 0.03 ms late .*, not corrected: the delay may be zero",
+        ),
+        (-4e-4, r"stamps 0.40 \+- 0.03 ms early .*, corrected"),
+        (0.1e-4, r"delay relative to the first unit: zero within \+-0.03 ms"),
+    ],
+)
+def test_the_words_on_a_delay_say_what_may_be_zero(value, words):
+    said = _delay_words(StampDelay((3, 4, 5), value, 3e-5), corrected=True)
+    assert re.fullmatch(words.replace(" +- ", r" \+- "), said)
