@@ -483,7 +483,10 @@ def _lost_words(result: Calibration) -> list[str]:
         # 1 % of the samples is worth a look.
         if count.max() <= (0.01 * found.blocks.count.sum() if usual else 0):
             continue
-        called = "frozen" if why == "repeated" else why.replace("_", " ")
+        # At the end of its range a gyro repeats one value, too.
+        called = why.replace("_", " ")
+        if why == "repeated":
+            called = "that repeat one value"
         which = ", ".join(result.names[i] for i in np.flatnonzero(count))
         who = "every channel" if count.all() else which
         words.append(f"{int(count.sum())} {called} ({who})")
