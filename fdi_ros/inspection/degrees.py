@@ -49,6 +49,9 @@ GENTLE_ROTATION, GENTLE_OVER_NOISE = 0.01, 10.0
 #: Swings of gravity that rates in rad/s foretell, rad: a multicopter and a pendulum swing
 #: with gravity, and so far only if they fly or swing hard.
 LEAST_SWING = 0.3
+#: Largest change of the size of the specific force, as a share of it, over the square of
+#: the swings: about 1 on a pendulum and 0.35 in a multicopter that keeps its height.
+LARGEST_CHANGE = 0.1
 #: Share of the swings of the accelerometers that the rates explain. In healthy recordings
 #: in which they are 57 times too small, by chance, it is 0.01.
 LEAST_SHARED = 0.5
@@ -137,6 +140,7 @@ def _swings_in_degrees(report: TopicReport) -> bool:
         one
         for one in swings
         if one.size > LEAST_SWING
+        and one.change < LARGEST_CHANGE * one.size**2
         and one.shared > LEAST_SHARED
         and abs(one.factor / DEGREES.factor - 1.0) < NEAR
     ]

@@ -35,6 +35,8 @@ class Swing(NamedTuple):
     seen: float
     #: product of both
     both: float
+    #: standard deviation of the size of the specific force, as a share of its mean
+    change: float = 0.0
 
     @property
     def size(self) -> float:
@@ -64,7 +66,7 @@ def swings_of(rates: NoiseSegments, forces: NoiseSegments) -> list[Swing]:
 
 def sum_of(swings: Sequence[Swing]) -> Swing:
     """Return the swings of several windows together."""
-    blocks, foretold, seen, both = map(sum, zip(*swings, strict=True))
+    blocks, foretold, seen, both, _ = map(sum, zip(*swings, strict=True))
     return Swing(round(blocks), foretold, seen, both)
 
 
@@ -128,4 +130,5 @@ def _swing(rate: Array, force: Array, step: float) -> Swing:
         float((foretold**2).sum()),
         float((seen**2).sum()),
         float((foretold * seen).sum()),
+        float(size.std() / size.mean()),
     )

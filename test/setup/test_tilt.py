@@ -119,6 +119,25 @@ def test_healthy_rates_never_foretell_57_times_the_tilt(kind, seed):
     assert not (abs(found.factor / DEGREES - 1.0) < 0.3 and found.shared > 0.25)
 
 
+def test_a_pendulum_with_its_sensor_off_the_centre_is_no_unit_in_degrees(tmp_path):
+    """Gravity swings with it, and the lever arm shows a 57th of the swings, in phase."""
+    random = np.random.default_rng(3)
+    length = 2.0
+    time = np.arange(30 * RATE) / RATE
+    turn = math.sqrt(9.81 / length)
+    angle = 0.6 * np.sin(turn * time)
+    rate = np.column_stack([0.6 * turn * np.cos(turn * time), 0.0 * time, 0.0 * time])
+    force = np.zeros_like(rate)
+    force[:, 2] = 9.81 * np.cos(angle) + length * rate[:, 0] ** 2
+    arm = np.array([0.0, 0.0, length / DEGREES])
+    force += np.cross(np.gradient(rate, 1.0 / RATE, axis=0), arm)
+    found = sum_of(swings_of(*halves(random, rate, force)))
+    assert found.factor == pytest.approx(DEGREES, rel=0.2)
+    assert found.shared > 0.5
+    path = recording(random, tmp_path, rate, force, 1.0)
+    assert in_degrees(inspect(path).reports) == ""
+
+
 @pytest.mark.parametrize("factor", [1.0, DEGREES])
 def test_the_factor_is_that_of_the_unit_of_the_rates(factor):
     random = np.random.default_rng(5)
