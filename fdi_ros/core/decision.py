@@ -53,16 +53,7 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
     faulty, undecided = confirm(decision, settings)
     broken = (evidence.broken | evidence.intermittent) & ~decision.faulty
     faulty |= evidence.certain & ~decision.faulty
-    if settings.by_evidence:
-        # A set by evidence ends with its evidence, a set by votes after `clean_time`
-        # without doubt. A member that nothing checks remains in doubt.
-        decision.voted |= undecided
-        if evidence.stamp - decision.last_doubt >= settings.clean_time:
-            decision.voted = 0
-        lasting = evidence.unclear if evidence.judged else decision.ambiguous
-        wanted = decision.voted | evidence.undecided | lasting
-    else:
-        wanted = decision.ambiguous | undecided
+    wanted = wanted_set(settings, decision, evidence, undecided)
     follow_declared(settings, decision, evidence)
     returns = 0
     clears = False
@@ -82,14 +73,38 @@ def decide(settings: PathSettings, decision: Decision, evidence: Evidence) -> bo
     if after == decision.faulty and wanted == decision.ambiguous:
         return False
     decision.ambiguous = wanted
-    for i in range(settings.n):
-        if after >> i & 1 and not decision.faulty >> i & 1:
-            decision.why[i] = reason_for(evidence, i)
-        elif not after >> i & 1:
-            decision.why[i] = UNDECLARED
-    decision.faulty = after
+    set_faulty(settings, decision, evidence, after)
     forget_alarms(decision, settings)
     return True
+
+
+@compiled
+def wanted_set(
+    settings: PathSettings, decision: Decision, evidence: Evidence, undecided: int
+) -> int:
+    """Return the set that is AMBIGUOUS by the votes for ``undecided`` and by the evidence."""
+    if not settings.by_evidence:
+        return decision.ambiguous | undecided
+    # A set by evidence ends with its evidence, a set by votes after `clean_time`
+    # without doubt. A member that nothing checks remains in doubt.
+    decision.voted |= undecided
+    if evidence.stamp - decision.last_doubt >= settings.clean_time:
+        decision.voted = 0
+    lasting = evidence.unclear if evidence.judged else decision.ambiguous
+    return decision.voted | evidence.undecided | lasting
+
+
+@compiled
+def set_faulty(
+    settings: PathSettings, decision: Decision, evidence: Evidence, faulty: int
+) -> None:
+    """Set the faulty channels, and keep the reasons of those that are new."""
+    for i in range(settings.n):
+        if not faulty >> i & 1:
+            decision.why[i] = UNDECLARED
+        elif not decision.faulty >> i & 1:
+            decision.why[i] = reason_for(evidence, i)
+    decision.faulty = faulty
 
 
 @compiled

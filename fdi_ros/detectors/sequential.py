@@ -108,7 +108,7 @@ from fdi_ros.estimator.snapshots import inflate_delays, keep_snapshot, pass_hole
 from fdi_ros.estimator.start_bias import doubt_start
 from fdi_ros.model.geometry import MIN_CHANNELS, MIN_SINGULAR_RATIO, Geometry
 from fdi_ros.model.noise import FalseAlarmRate, NoiseModel
-from fdi_ros.model.samples import MAX_RATE
+from fdi_ros.model.samples import MAX_RATE, Array
 
 # shortest fault that is declared, s: two samples at 100 Hz, because one value decides nothing
 LEAST_TIME = 0.02
@@ -185,28 +185,10 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     """Process a complete block: noise, states, and evidence on the longer time scales."""
     kf = state.estimator
     case = state.case
-    n = params.sensors.n
-    noise = kf.noise
     learns = not case.open
-    fade_fits(case, n, kf.span if learns else 0.0)
+    fade_fits(case, params.sensors.n, kf.span if learns else 0.0)
     close_turn(params, kf)
-    update_largest_rate(
-        noise, kf.rates[0, 0] ** 2 + kf.rates[0, 1] ** 2 + kf.rates[0, 2] ** 2
-    )
-    follow_loudness(noise, n, params.louder, kf.span)
-    update_unknown(noise, n, kf.span)
-    update_sample_variance(
-        noise,
-        n,
-        kf.masks[0],
-        params.length,
-        kf.all_blocks,
-        params.adaptation_gain,
-        params.expected,
-        learns,
-    )
-    update_shared_level(params, kf)
-    follow_vibration(params, kf)
+    follow_block_noise(params, kf, learns)
     predict(params.layout, kf.states, kf.seconds - kf.learned_at)
     kf.learned_at = kf.seconds
     follow_reference(params, state)
@@ -222,24 +204,9 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
         update_from_block(params, kf, state.scales, learns)
         keep_information(params, state)
     update_rest(params, kf)
-    if kf.rest and noise.regime == MOTION and learns:
-        change_regime(noise, n, REST, False)
-    suspicious = mean_of(params, state.estimator, state.scales) > math.sqrt(
-        params.limit
-    )
-    kf.held_seconds = kf.held_seconds + kf.span if suspicious else 0.0
-    if learns and not suspicious:
-        # These channels belonged to a case that was refused.
-        kf.under_test = 0
-        update_line(params, kf)
-    holds = kf.held_seconds > 0.0 and kf.held_seconds <= LONG_TIME and not case.open
-    # Without redundancy, errors show only at rest.
-    if not holds and (kf.judged or kf.rest):
-        learn(params, kf, weight)
-    quiet = learns and not suspicious and kf.force_variance == 0.0
-    if quiet and kf.seconds - kf.snapshot_at >= SNAPSHOT_TIME:
-        kf.snapshot_at = kf.seconds
-        keep_snapshot(params, kf)
+    if kf.rest and kf.noise.regime == MOTION and learns:
+        change_regime(kf.noise, params.sensors.n, REST, False)
+    learn_from_block(params, state, weight)
     if learns:
         compensate_delays(params, state, sample)
     predict_innovation_covariance(params, kf)
@@ -248,6 +215,50 @@ def process_block(params: Constants, state: State, sample: SampleInput) -> None:
     if kf.all_blocks % BLOCKS_PER_COARSE == 0:
         look_for_slow_faults(params, state)
         doubt_start(params, kf, not state.restored)
+
+
+@compiled
+def follow_block_noise(params: Constants, kf: Estimator, learns: bool) -> None:
+    """Follow the noise of the channels, of its own and shared, with the values of a block."""
+    noise = kf.noise
+    n = params.sensors.n
+    rate = kf.rates[0]
+    update_largest_rate(noise, rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
+    follow_loudness(noise, n, params.louder, kf.span)
+    update_unknown(noise, n, kf.span)
+    update_sample_variance(
+        noise,
+        n,
+        kf.masks[0],
+        params.length,
+        kf.all_blocks,
+        params.adaptation_gain,
+        params.expected,
+        learns,
+    )
+    update_shared_level(params, kf)
+    follow_vibration(params, kf)
+
+
+@compiled
+def learn_from_block(params: Constants, state: State, weight: float) -> None:
+    """Correct the states by a block of this weight, unless a fault has been suspected for a short time."""
+    kf = state.estimator
+    learns = not state.case.open
+    suspicious = mean_of(params, kf, state.scales) > math.sqrt(params.limit)
+    kf.held_seconds = kf.held_seconds + kf.span if suspicious else 0.0
+    if learns and not suspicious:
+        # These channels belonged to a case that was refused.
+        kf.under_test = 0
+        update_line(params, kf)
+    holds = learns and 0.0 < kf.held_seconds <= LONG_TIME
+    # Without redundancy, errors show only at rest.
+    if not holds and (kf.judged or kf.rest):
+        learn(params, kf, weight)
+    quiet = learns and not suspicious and kf.force_variance == 0.0
+    if quiet and kf.seconds - kf.snapshot_at >= SNAPSHOT_TIME:
+        kf.snapshot_at = kf.seconds
+        keep_snapshot(params, kf)
 
 
 @compiled
@@ -594,30 +605,11 @@ class Sequential(Detector):
                 "louder": louder,
             },
         )
-        n = geometry.n
-        noise = self.noise
         self._fill_units()
         self._fill_times()
         self._fill_sets()
+        self._fill_noise(walk, delay_std)
         params = self.constants[0]
-        prepare_layout(
-            params["layout"],
-            geometry.axes,
-            params["unit"][:n],
-            len(geometry.units),
-            {
-                "bias": noise.bias_std,
-                "scale": np.maximum(noise.scale_std, LEAST_SCALE),
-                "delay": delay_std,
-                "asymmetry": noise.nonlinearity_std,
-            },
-            {"bias": walk},
-        )
-        params["expected"][:n] = noise.noise_std**2
-        params["timing"][:n] = np.maximum(noise.timing_std, LEAST_TIMING)
-        params["nonlinearity"][:n] = np.maximum(
-            noise.nonlinearity_std, LEAST_NONLINEARITY
-        )
         params["layout"]["shared_scale"] = shared_scale_std
         params["gain_is_fault"] = gain_is_fault
         params["louder"] = louder
@@ -629,6 +621,31 @@ class Sequential(Detector):
         params["largest_move"] = largest_move
         params["limit"] = self.run_length
         params["confidence"] = confidence
+
+    def _fill_noise(self, bias_walk: Array, delay_std: float) -> None:
+        """Fill the error states and what the noise model says of the channels."""
+        n = self.geometry.n
+        noise = self.noise
+        params = self.constants[0]
+        priors: dict[str, float | Array] = {
+            "bias": noise.bias_std,
+            "scale": np.maximum(noise.scale_std, LEAST_SCALE),
+            "delay": delay_std,
+            "asymmetry": noise.nonlinearity_std,
+        }
+        prepare_layout(
+            params["layout"],
+            self.geometry.axes,
+            params["unit"][:n],
+            len(self.geometry.units),
+            priors,
+            {"bias": bias_walk},
+        )
+        params["expected"][:n] = noise.noise_std**2
+        params["timing"][:n] = np.maximum(noise.timing_std, LEAST_TIMING)
+        params["nonlinearity"][:n] = np.maximum(
+            noise.nonlinearity_std, LEAST_NONLINEARITY
+        )
 
     def _fill_units(self) -> None:
         """Fill the unit of each channel and the channels of each unit."""

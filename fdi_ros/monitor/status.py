@@ -34,7 +34,7 @@ from fdi_ros.model.geometry import MIN_CHANNELS, Geometry, lone_pairs, one_of_wo
 from fdi_ros.model.noise import assumption_words
 from fdi_ros.model.quantity import FORCE, RATE, Quantity
 from fdi_ros.model.samples import Array, Mask
-from fdi_ros.monitor.integrity import NO_LEVEL, Integrity
+from fdi_ros.monitor.integrity import NO_LEVEL, Axes, Integrity
 from fdi_ros.system.text import listed, plus_minus
 
 # standard deviations from which two channels of a larger set surely differ
@@ -341,11 +341,13 @@ def status_of(
         np.flatnonzero((state == ChannelState.OK) | (state == ChannelState.UNCHECKED))
     )
     valid = begun and bool(last["valid"])
-    x, y, z = (natural * last["level"]).tolist()
-    after_loss = NO_LEVEL
+    level = after_loss = NO_LEVEL
     if valid:
-        after_loss = integrity.after_loss(subsets, int(now["fused"]) & well)
+        level = _scaled(last["level"].tolist(), natural)
+        lossy = integrity.after_loss(subsets, int(now["fused"]) & well)
+        after_loss = _scaled(lossy, natural)
     late, late_std = _delays(guard, begun)
+    bias = (core["bias"]["value"] + core["sample"]["estimate"]["bias"])[:n]
     return Status(
         config=config,
         stamp=int(last["stamp"]) if begun else 0,
@@ -359,20 +361,11 @@ def status_of(
         all_repeat=begun and bool(now["all_repeat"]),
         can_detect=_named(names, seen),
         can_isolate=_named(names, isolable & seen),
-        bias=tuple(
-            (
-                natural
-                * (core["bias"]["value"] + core["sample"]["estimate"]["bias"])[:n]
-            ).tolist()
-        ),
+        bias=tuple((natural * bias).tolist()),
         bias_state=_format_bias(core["bias"], names, config.bias.turn_on_std),
         note=note,
-        protection_level=(x, y, z) if valid else NO_LEVEL,
-        protection_level_after_loss=(
-            natural * after_loss[0],
-            natural * after_loss[1],
-            natural * after_loss[2],
-        ),
+        protection_level=level,
+        protection_level_after_loss=after_loss,
         units=_units(core, guard, late, late_std),
         delays=tuple(late[:, 0].tolist()),
         delay_std=tuple(late_std[:, 0].tolist()),
@@ -381,6 +374,12 @@ def status_of(
         copies=_copies(core, geometry, config),
         apart=_apart(guard, core, quantity),
     )
+
+
+def _scaled(axes: Sequence[float], natural: float) -> Axes:
+    """Multiply three values of the axes of the body."""
+    x, y, z = axes
+    return natural * x, natural * y, natural * z
 
 
 def _channel(

@@ -393,13 +393,7 @@ class Report(Sink):
         scores = summary.scores
         story = summary.story
         unit = self._unit
-        # Injected faults and gaps in the recording are shaded.
-        times = [("fault", fault.start_s, fault.stop_s) for fault in scores.faults]
-        times += [("gap", begin, end) for begin, end in story.gaps]
-        shapes = [
-            {"type": "rect", "kind": kind, "x0": begin, "x1": end}
-            for kind, begin, end in times
-        ]
+        shapes = _shaded(summary)
         common = {"shapes": shapes, "marks": _marks(scores.faults, story.episodes)}
         scale = {"robust": True, "needed": _in_view(scores.faults, story.episodes)}
         said = _autopilot_marks(summary)
@@ -421,7 +415,6 @@ class Report(Sink):
         for curves in self._curves:
             curves.alone.finish()
         statistics = [curves.statistic(spoken, alone) for curves in self._curves]
-        stretches = stretch_words(story)
         return [
             Section(
                 "The recording",
@@ -431,11 +424,7 @@ class Report(Sink):
             ),
             _episode_section(story, bool(scores.faults), unit, self._origin),
             *_temperature_section(summary, spoken),
-            *(
-                [Section("Stretches", "Each is judged for itself.", stretches)]
-                if stretches
-                else []
-            ),
+            *_stretch_section(story),
             *(
                 section
                 for curves in self._curves
@@ -506,6 +495,24 @@ def _throttle(summary: Summary) -> dict[str, list[float]] | None:
         return None
     x, y = _within(summary, course)
     return {"x": x, "y": y}
+
+
+def _shaded(summary: Summary) -> list[dict[str, Any]]:
+    """Return what shades the times of the injected faults and of the gaps in the recording."""
+    times = [("fault", fault.start_s, fault.stop_s) for fault in summary.scores.faults]
+    times += [("gap", begin, end) for begin, end in summary.story.gaps]
+    return [
+        {"type": "rect", "kind": kind, "x0": begin, "x1": end}
+        for kind, begin, end in times
+    ]
+
+
+def _stretch_section(story: Story) -> list[Section]:
+    """Return the section about the stretches, none if there is one stretch."""
+    stretches = stretch_words(story)
+    if not stretches:
+        return []
+    return [Section("Stretches", "Each is judged for itself.", stretches)]
 
 
 def _mode_shapes(summary: Summary) -> list[dict[str, Any]]:

@@ -174,12 +174,7 @@ def calibrate(
         samples = _as_monitored(block, data, used, found, beside.ready)
         n = len(active)
         faults, spectrum = _watch(samples, beside.config, beside.names, n)
-        of_gyros = tuple(span for span in faults if min(span.channels) < n)
-        of_forces = tuple(
-            span._replace(channels=tuple(i - n for i in span.channels))
-            for span in faults
-            if min(span.channels) >= n
-        )
+        of_gyros, of_forces = _split(faults, n)
         if of_gyros:
             without = _without(of_gyros, data, nominal.channel_names)
             found = estimate(without, sensors)
@@ -191,21 +186,12 @@ def calibrate(
         raise CalibrationError(
             f"the recording leaves the fit undetermined ({error})"
         ) from error
-    units = [
-        tuple(np.flatnonzero(sensors.unit == k).tolist())
-        for k in range(1, sensors.units)
-    ]
     return Calibration(
         names=nominal.channel_names,
         nominal=nominal.axes,
         estimate=found,
         timing=float(_timing(config, active, found).max()),
-        delays=tuple(
-            StampDelay(
-                unit, float(found.delay[unit[0]]), float(found.delay_std[unit[0]])
-            )
-            for unit in units
-        ),
+        delays=_stamp_delays(found, sensors),
         faults=of_gyros,
         unusable=data.unusable | {"spikes": np.asarray(spiky.sum(axis=0))},
         duration=len(data.stamp) * data.step,
@@ -215,6 +201,28 @@ def calibrate(
         accelerometers=beside.fit,
         refused=beside.refused,
     )
+
+
+def _split(faults: Sequence[Span], n: int) -> tuple[tuple[Span, ...], tuple[Span, ...]]:
+    """Split the faults into those of the n gyros and those of accelerometers, whose channels count from 0."""
+    of_gyros = tuple(span for span in faults if min(span.channels) < n)
+    of_forces = tuple(
+        span._replace(channels=tuple(i - n for i in span.channels))
+        for span in faults
+        if min(span.channels) >= n
+    )
+    return of_gyros, of_forces
+
+
+def _stamp_delays(found: StateEstimate, sensors: Priors) -> tuple[StampDelay, ...]:
+    """Return the delay of each unit but the first."""
+    delays = []
+    for k in range(1, sensors.units):
+        unit = tuple(np.flatnonzero(sensors.unit == k).tolist())
+        first = unit[0]
+        delay, std = float(found.delay[first]), float(found.delay_std[first])
+        delays.append(StampDelay(unit, delay, std))
+    return tuple(delays)
 
 
 def _prepared(
