@@ -387,7 +387,8 @@ def _places(
     names: Sequence[str], triads: list[list[str]]
 ) -> tuple[tuple[int, int, int], ...]:
     """Return the indices of the columns of each IMU."""
-    return tuple((names.index(x), names.index(y), names.index(z)) for x, y, z in triads)
+    place = names.index
+    return tuple((place(x), place(y), place(z)) for x, y, z in triads)
 
 
 def _note_choice(choice: _Choice, columns: Columns, note: Note) -> None:
@@ -596,9 +597,8 @@ def _samples(
 ) -> list[tuple[Source, ImuSamples]]:
     """Return the samples of each IMU in lines, as of `_numbers`, that end at bytes (k,)."""
     # Impossible dates are left out later.
-    stamp = np.round(np.clip(table[:, 0] * columns.tick * 1e6, -1.0, 9e18)).astype(
-        np.int64
-    )
+    micros = np.clip(table[:, 0] * columns.tick * 1e6, -1.0, 9e18)
+    stamp = np.round(micros).astype(np.int64)
     found = []
     behind = 3 * len(columns.imus)
     for k, factor in enumerate(columns.factors):

@@ -91,14 +91,8 @@ def progress(
             if not bar.disable:
                 bar.refresh()
                 continue
-            spent = clock() - begun
             share = done
-            words = f"{spent:.0f} s so far"
-            if share > 0:
-                words = f"{percent(share)} done after {spent:.0f} s"
-            if said < share < 1.0:
-                # While one part takes long, nothing shows how long.
-                words += f", about {spent * (1 / share - 1):.0f} s left"
+            words = _progress_words(share, clock() - begun, share > said)
             said = share
             with suppress(OSError, ValueError):
                 stream.write(f"fdi: {what}{', ' if what else ''}{words}\n")
@@ -122,6 +116,17 @@ def progress(
         ended.set()
         thread.join()
         bar.close()
+
+
+def _progress_words(share: float, spent: float, grew: bool) -> str:
+    """Return the share done after ``spent`` s, and the time left if the share ``grew``."""
+    if share <= 0:
+        return f"{spent:.0f} s so far"
+    words = f"{percent(share)} done after {spent:.0f} s"
+    if grew and share < 1.0:
+        # While one part takes long, nothing shows how long.
+        words += f", about {spent * (1 / share - 1):.0f} s left"
+    return words
 
 
 # Files and words

@@ -558,7 +558,9 @@ def _entry(name: str, value: Any, remark: str, indent: int) -> Iterator[str]:
         f"# {meaning}. {remark[0].upper()}{remark[1:]}" if remark else f"# {meaning}"
     )
     rows = list(_value(value))
-    line = f"{margin}{name.rpartition('.')[2]}: {rows[0] if len(rows) == 1 else ''}".rstrip()
+    key = name.rpartition(".")[2]
+    row = rows[0] if len(rows) == 1 else ""
+    line = f"{margin}{key}: {row}".rstrip()
     if len(rows) == 1 and len(line) + 1 + len(comment) <= WIDTH:
         yield f"{line} {comment}"
         return

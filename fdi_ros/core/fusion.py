@@ -166,8 +166,9 @@ def update_gain(
             now.variance[i] = max(now.variance[i], expected)
         now.uncertainty[i] = now.variance[i] + estimate.covariance[i, i]
         now.own[i] = max(now.uncertainty[i] - estimate.common[i], now.variance[i])
+        is_fused = now.fused >> i & 1
         for a in range(3):
-            now.gain[a, i] = subset.gain[i, a] if now.fused >> i & 1 else 0.0
+            now.gain[a, i] = subset.gain[i, a] if is_fused else 0.0
     if subset.spans:
         fill_parity(now.parity, sensors, now.fused, now.own)
         for a in range(3):

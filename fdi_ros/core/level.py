@@ -99,7 +99,8 @@ def passes_test(
             least = min(least, error_ratio[i])
     for i in range(n):
         # In most samples this cheap bound decides.
-        if mask >> i & 1 and not abs(residual[i]) <= subset.limit[i] * math.sqrt(least):
+        bound = subset.limit[i] * math.sqrt(least)
+        if mask >> i & 1 and not abs(residual[i]) <= bound:
             before = after = 0.0
             for j in range(n):
                 if mask >> j & 1:

@@ -162,7 +162,8 @@ def read_force(data: Bytes, at: int, little: bool, force: Array) -> None:
     start = at + 8 * IMU_BEFORE_FORCE
     read_doubles(data, start, 3, little, force)
     first = np.int64(read_bits(data, start + 24, 8, little)).view(np.float64)
-    if first == -1.0 or (force[0] == 0.0 and force[1] == 0.0 and force[2] == 0.0):
+    is_zero = force[0] == 0.0 and force[1] == 0.0 and force[2] == 0.0
+    if first == -1.0 or is_zero:
         for a in range(3):
             force[a] = math.nan
 

@@ -67,7 +67,9 @@ def single_losses(mask: int) -> list[int]:
 
 def all_sets(n: int) -> Mask:
     """Return for each of the 2^n sets whether it contains each channel, (2^n, n)."""
-    sets: Mask = (np.arange(1 << n)[:, None] >> np.arange(n) & 1).astype(np.bool_)
+    masks = np.arange(1 << n)[:, None]
+    bits = masks >> np.arange(n) & 1
+    sets: Mask = bits.astype(np.bool_)
     return sets
 
 

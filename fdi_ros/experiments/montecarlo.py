@@ -395,19 +395,15 @@ def run_study(
     ]
     sections = []
     trials = run(TRIALS, prepared)
-    for one, protocol, preparation, counts in zip(
-        study.sections, protocols, prepared, trials, strict=True
-    ):
+    parts = zip(study.sections, protocols, prepared, trials, strict=True)
+    for section, protocol, preparation, counts in parts:
         cells = zip(protocol.trial_cells(), counts, strict=True)
         figures = [
             protocol.summary(cell, reduce(added, blocks), preparation)
             for cell, blocks in cells
         ]
-        sections.append(
-            SectionResult(
-                one.kind, one.settings, preparation, protocol.refusals(), figures
-            )
-        )
+        kind, settings, refusals = section.kind, section.settings, protocol.refusals()
+        sections.append(SectionResult(kind, settings, preparation, refusals, figures))
     return StudyResult(
         STUDY_FORMAT, __version__, study.name, study.title, study.seed, sections
     )

@@ -239,7 +239,9 @@ def _rates_title(group: Group, cell: Figures) -> str:
 
 def _double(group: Group, cell: Figures) -> Section:
     def mean(at: Figures) -> str:
-        return f"{sum(k * n for k, n in enumerate(at['set_sizes'])) / max(sum(at['set_sizes']), 1):.2f}"
+        sizes = at["set_sizes"]
+        suspects = sum(k * n for k, n in enumerate(sizes))
+        return f"{suspects / max(sum(sizes), 1):.2f}"
 
     words = {
         "declared": _of("declared"),

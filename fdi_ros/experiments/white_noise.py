@@ -151,7 +151,8 @@ class Snapshot(CommonRate):
             ]
             rows = np.arange(count)[:, None]
             struck[rows, order] = True
-            z[rows, order] += cell.size * sigma * rng.choice([-1.0, 1.0], order.shape)
+            sign = rng.choice([-1.0, 1.0], order.shape)
+            z[rows, order] += cell.size * sigma * sign
         return z, struck
 
 
@@ -316,7 +317,8 @@ class Delay(CommonRate):
         if not cell.healthy:
             channel = rng.integers(n, size=count)
             sign = rng.choice([-1.0, 1.0], count)
-            z[np.arange(count), lead:, channel] += (cell.size * sigma * sign)[:, None]
+            error = cell.size * sigma * sign
+            z[np.arange(count), lead:, channel] += error[:, None]
         return z, None
 
     def loose(self) -> tuple[NoiseModel, float]:

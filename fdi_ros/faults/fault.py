@@ -290,8 +290,9 @@ class Injector:
         received = np.hstack([half.delivered for half in block.halves])
         for k, fault in enumerate(self.faults):
             index = list(self.channels[k])
+            since = time - fault.start
             struck = ChannelSamples(
-                time, time - fault.start, active[:, k], z[:, index], received[:, index]
+                time, since, active[:, k], z[:, index], received[:, index]
             )
             # Both the recorded value and the added one may be infinite.
             with np.errstate(invalid="ignore", over="ignore"):

@@ -301,7 +301,8 @@ class Delay(FaultKind):
         for name, now in (("z", samples.z), ("received", samples.received)):
             past = memory.get(name, np.repeat(now[:1], self.size, axis=0))
             known = np.concatenate([past, now])
-            now[active], memory[name] = known[: len(now)][active], known[len(now) :]
+            now[active] = known[: len(now)][active]
+            memory[name] = known[len(now) :]
 
 
 @dataclass(frozen=True)

@@ -170,7 +170,8 @@ class SigningFile(KeptFile[SigningTimes]):
     def decode(self, found: Any) -> SigningTimes:
         """Return the content of a file, parsed."""
         latest = tuple(
-            ((int(a), int(b), int(c)), int(time)) for a, b, c, time in found["latest"]
+            ((int(system), int(component), int(link)), int(time))
+            for system, component, link, time in found["latest"]
         )
         newest = int(found["newest"])
         times = [newest, *(time for _, time in latest)]

@@ -147,9 +147,8 @@ class Geometry:
         azimuth = 2 * np.pi * np.arange(n) / n
         c = 1 / np.sqrt(3.0)
         s = np.sqrt(2 / 3)
-        return cls(
-            np.column_stack([s * np.cos(azimuth), s * np.sin(azimuth), np.full(n, c)])
-        )
+        x, y = s * np.cos(azimuth), s * np.sin(azimuth)
+        return cls(np.column_stack([x, y, np.full(n, c)]))
 
     @classmethod
     def from_triads(

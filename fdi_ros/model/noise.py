@@ -207,7 +207,8 @@ def noisier_words(
         return ""
     who = ", ".join(f"{names[i]} ({noise[i] * factor:.2g} {unit})" for i, _ in found)
     verb = "is" if len(found) == 1 else "are"
-    return f"{who} {verb} much noisier than the other units ({max(beside for _, beside in found) * factor:.2g} at most)"
+    others = max(beside for _, beside in found) * factor
+    return f"{who} {verb} much noisier than the other units ({others:.2g} at most)"
 
 
 # False-alarm rates

@@ -196,7 +196,8 @@ def felt_units(block: Block) -> tuple[int, ...]:
 
 def varies(values: Array) -> bool:
     """Whether any column of values (k, m) has two that differ; NaN are left out."""
-    return any(len(np.unique(one[~np.isnan(one)])) > 1 for one in values.T)
+    columns = (column[~np.isnan(column)] for column in values.T)
+    return any(len(np.unique(column)) > 1 for column in columns)
 
 
 def _delivering(block: Block) -> set[int]:

@@ -231,10 +231,11 @@ class Output:
         return np.asarray(self.rows["covariance"][:, FROM_TRIANGLE].reshape(-1, 3, 3))
 
     def __repr__(self) -> str:
-        seconds = (int(self.stamp[-1]) - int(self.stamp[0])) / 1e9 if len(self) else 0.0
-        rated = (
-            f", a rate in {percent(float(np.mean(self.valid)))}" if len(self) else ""
-        )
+        seconds = 0.0
+        rated = ""
+        if len(self):
+            seconds = (int(self.stamp[-1]) - int(self.stamp[0])) / 1e9
+            rated = f", a rate in {percent(float(np.mean(self.valid)))}"
         size = f"{len(self)} samples of {len(self.channel_names)} channels, {seconds:.3f} s"
         return f"Output({size}{rated}; {len(self.events)} changes of state)"
 

@@ -454,7 +454,8 @@ def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
         about = f", {where}{about}"
     elif about:
         about = f" ({about})"
-    return f"{one.who} {one.state} from {one.since_s:.3f} s{until}{about}{f'; before that {before}' if before else ''}"
+    earlier = f"; before that {before}" if before else ""
+    return f"{one.who} {one.state} from {one.since_s:.3f} s{until}{about}{earlier}"
 
 
 def warming_words(one: Episode, unit: Unit = RADIANS) -> str:

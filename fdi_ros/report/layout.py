@@ -634,7 +634,9 @@ class PageStore:
 
     def shows(self, name: str) -> bool:
         """Whether a series has any value."""
-        return bool(np.isfinite(self.spans()[1][:, list(self.kinds).index(name)]).any())
+        lowest = self.spans()[1]
+        values = lowest[:, list(self.kinds).index(name)]
+        return bool(np.isfinite(values).any())
 
     def data(self) -> dict[str, Any]:
         """Return the series for the scripts of the page."""

@@ -351,10 +351,12 @@ class LineReport:
                     whole if picture.waiting else f"{whole}{_format_figures(picture)}",
                 )
             )
-        return [
-            f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at * 100) % 100:02d}  {shown(words, LINE)}"
-            for at, words in lines
-        ]
+        return [f"{_clock_words(at)}  {shown(words, LINE)}" for at, words in lines]
+
+
+def _clock_words(at: float) -> str:
+    """Return a time since 1970 as local time, to hundredths of a second."""
+    return f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at * 100) % 100:02d}"
 
 
 def _format_figures(picture: Picture) -> str:

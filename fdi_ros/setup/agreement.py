@@ -133,7 +133,10 @@ def _turns_of(means: Array, nominal: Geometry) -> _Turns | None:
         nominal.channel_names[unit[0]].rpartition(".")[0] or "one triad"
         for unit in units
     ]
-    rates = [means[:, unit] @ np.linalg.inv(nominal.axes[unit]).T for unit in units]
+    inverses = [np.linalg.inv(nominal.axes[unit]) for unit in units]
+    rates = [
+        means[:, u] @ inverse.T for u, inverse in zip(units, inverses, strict=True)
+    ]
     ratio = np.median(turning[:, None] / turning[None], axis=2)
     return _Turns(units, names, means, rates, ratio)
 
@@ -144,7 +147,8 @@ def _have_one_scale(turns: _Turns) -> NDArray[np.bool_]:
     They are compared along the directions in which each unit turns most to least: one
     bad axis does not change the scale of the unit.
     """
-    variances = [np.linalg.eigvalsh(np.cov(turns.means[:, u].T)) for u in turns.units]
+    covariances = [np.cov(turns.means[:, unit].T) for unit in turns.units]
+    variances = [np.linalg.eigvalsh(one) for one in covariances]
     along = np.sqrt(np.maximum(variances, 1e-18))
     least = np.maximum(turns.ratio, (along[:, None] / along[None]).max(axis=2))
     return (least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE)
@@ -214,9 +218,8 @@ def _axes_of(signed: Array) -> list[str]:
 
 def _in_common(one: Array, other: Array) -> float:
     """Share of the rotation (W, 3) of two units that they have in common."""
-    return 1.0 - float(
-        ((one - other) ** 2).sum() / max((one**2).sum() + (other**2).sum(), 1e-30)
-    )
+    whole = max((one**2).sum() + (other**2).sum(), 1e-30)
+    return 1.0 - float(((one - other) ** 2).sum() / whole)
 
 
 def _check_response(moving: Array, nominal: Geometry) -> None:
@@ -350,7 +353,8 @@ def _against(first: Array, unit: Array) -> Mount:
     missed = float(square.sum()) / power
     shared = 1.0 - missed
     error = math.sqrt(float(np.mean(square)) * uncertainty)
-    if shared < SAME < 1.0 - float(((first - unit @ mirrored.T) ** 2).sum()) / power:
+    square_mirrored = (first - unit @ mirrored.T) ** 2
+    if shared < SAME < 1.0 - float(square_mirrored.sum()) / power:
         return Mount(
             "NOT KNOWN: mirrored relative to the first unit",
             shared,

@@ -99,7 +99,8 @@ def spikes(z: Array, axes: Array) -> Mask:
     # Vibration changes the usual size.
     for first in range(0, max(len(z) - 2, 0), SPIKE_PORTION):
         part = z[first : first + SPIKE_PORTION + 2]
-        size = np.abs((part[1:-1] - 0.5 * (part[2:] + part[:-2])) @ apart)
+        neighbours = 0.5 * (part[2:] + part[:-2])
+        size = np.abs((part[1:-1] - neighbours) @ apart)
         whole = size[np.isfinite(size).all(axis=1)]
         if len(whole) < SPIKE_PORTION // 4:
             continue

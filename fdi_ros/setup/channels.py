@@ -58,8 +58,9 @@ class ChannelFit:
         self.angle_error = np.sqrt(np.maximum(across, 0) / 2) / length
         """(n,) standard error of the angle in each of two directions, rad."""
         apart = projector(axes)
+        checks = max(n - 3, 1)
         squares = [
-            np.trace(apart @ each[:, a, :, a] @ apart) / max(n - 3, 1) for a in range(3)
+            np.trace(apart @ each[:, a, :, a] @ apart) / checks for a in range(3)
         ]
         self.axis_errors = np.sqrt(np.maximum(squares, 0.0))
         """(3,) uncertainty of the disagreement of axes along x, y and z of the body."""

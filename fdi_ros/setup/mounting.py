@@ -176,7 +176,8 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     if np.linalg.matrix_rank(axes, tol=1e-2) < 3:
         return Loss(lost)
     gdop = float(np.sqrt(np.trace(np.linalg.inv(axes.T @ axes))))
-    std = np.sqrt(np.diag(np.linalg.inv((axes.T / noise.noise_std[kept] ** 2) @ axes)))
+    information = (axes.T / noise.noise_std[kept] ** 2) @ axes
+    std = np.sqrt(np.diag(np.linalg.inv(information)))
     try:
         rest = geometry.subset(kept)
         numbers = np.flatnonzero(kept)
@@ -335,8 +336,9 @@ def _double_words(result: Mounting) -> str:
     worst = max(spanning, key=lambda loss: loss.gdop)
     seen = sum(bool(loss.detectable) for loss in spanning)
     named = sum(bool(loss.isolable) for loss in spanning)
+    lost = " and ".join(names[i] for i in worst.lost)
     return (
-        f"{words}, GDOP {best:.3f} to {worst.gdop:.3f} (worst without {' and '.join(names[i] for i in worst.lost)});"
+        f"{words}, GDOP {best:.3f} to {worst.gdop:.3f} (worst without {lost});"
         f" a further fault of at least one channel is detected for {seen}, isolated for {named}"
     )
 

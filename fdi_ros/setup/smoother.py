@@ -146,7 +146,8 @@ def find_random_walk(of: NormalEquations) -> RandomWalk:
     shift = 0.0
     if 0 < best < len(WALKS) - 1:
         a, b, c = logs[best - 1 : best + 2]
-        shift = float(np.clip(0.5 * (a - c) / min(a - 2 * b + c, -1e-9), -0.5, 0.5))
+        curvature = min(a - 2 * b + c, -1e-9)
+        shift = float(np.clip(0.5 * (a - c) / curvature, -0.5, 0.5))
     value = float(WALKS[best] * (WALKS[1] / WALKS[0]) ** shift)
     likely = np.array(logs) > max(logs[best], none) - POSSIBLE
     possible = float(WALKS[likely].max(initial=0.0))
@@ -167,12 +168,14 @@ def smooth(
         constant = covariance @ side
     else:
         k = len(known[0])
-        first = known[0] / of.prior[n : n + k]
-        p = known[1] / np.outer(of.prior[n : n + k], of.prior[n : n + k])
+        prior = of.prior[n : n + k]
+        first = known[0] / prior
+        p = known[1] / np.outer(prior, prior)
         free = np.linalg.inv(information[k:, k:])
         by = -free @ information[k:, :k]
         constant = np.concatenate([first, free @ side[k:] + by @ first])
-        covariance = np.block([[p, p @ by.T], [by @ p, free + by @ p @ by.T]])
+        cross = by @ p
+        covariance = np.block([[p, p @ by.T], [cross, free + cross @ by.T]])
     curve = (solved[:, -1] - solved[:, n:-1] @ constant).reshape(-1, n)
     # The mean of the biases by itself, and by the constants.
     mean = solved.reshape(len(curve), n, -1).mean(axis=0)

@@ -159,7 +159,8 @@ def html_table(
     """Return an HTML table for a notebook."""
 
     def line(cells: Iterable[object], tag: str) -> str:
-        return f"<tr>{''.join(f'<{tag}>{html.escape(shown(cell, LINE))}</{tag}>' for cell in cells)}</tr>"
+        texts = [html.escape(shown(cell, LINE)) for cell in cells]
+        return f"<tr>{''.join(f'<{tag}>{text}</{tag}>' for text in texts)}</tr>"
 
     body = "".join(line(row, "td") for row in rows)
     return f"<table><caption>{html.escape(shown(caption, LINE))}</caption>{line(head, 'th')}{body}</table>"
