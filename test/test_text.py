@@ -114,3 +114,45 @@ class Result(NamedTuple):
     e: int
 """
     assert undocumented(source) == ["Result.b", "Result.e"]
+
+
+#: `FAR` is a variance ratio of vibration and standard deviations of a start bias.
+SEVERAL_MEANINGS = {"FAR"}
+
+
+def numbers_of(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """Yield name and value of the numeric constants of a module."""
+    for node in tree.body:
+        if not isinstance(node, ast.Assign):
+            continue
+        pairs = [(target, node.value) for target in node.targets]
+        for target, value in list(pairs):
+            if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+                pairs += zip(target.elts, value.elts, strict=True)
+        for target, value in pairs:
+            is_constant = isinstance(target, ast.Name) and target.id.isupper()
+            if is_constant and is_number(value):
+                yield target.id, ast.unparse(value)
+
+
+def is_number(node: ast.expr) -> bool:
+    """Return whether a value is a number, or computed from numbers and names."""
+    if isinstance(node, ast.Constant):
+        return isinstance(node.value, int | float)
+    if isinstance(node, ast.BinOp):
+        return all(
+            isinstance(one, ast.Name) or is_number(one)
+            for one in (node.left, node.right)
+        )
+    return isinstance(node, ast.UnaryOp) and is_number(node.operand)
+
+
+def test_a_numeric_constant_has_one_meaning():
+    values: dict[str, dict[str, str]] = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for name, value in numbers_of(ast.parse(path.read_text(encoding="utf-8"))):
+            values.setdefault(name, {})[str(path.relative_to(ROOT))] = value
+    several = {
+        name: found for name, found in values.items() if len(set(found.values())) > 1
+    }
+    assert set(several) <= SEVERAL_MEANINGS, several

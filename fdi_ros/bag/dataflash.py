@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_log import (
     FLU,
+    GPS_FIX_3D,
     FlightLog,
     ImuSamples,
     Portion,
@@ -167,8 +168,6 @@ _SUBSYSTEMS: dict[Any, str] = (
 """Of ERR records (LogErrorSubsystem of AP_Logger) that may have to do with IMUs."""
 _GPS_EPOCH, _WEEK, _LEAP = 315_964_800, 604_800, 18
 """Start of GPS time since 1970, a week, and GPS ahead of UTC since 2017, s."""
-#: GPS status from which on the time is known: a fix in three dimensions
-_FIX = 3
 
 
 @compiled
@@ -183,11 +182,10 @@ def record_end(data: Bytes, position: int, sizes: Int, final: bool) -> int:
     end = position + size
     if end > len(data) or (end + 2 > len(data) and not final):
         return -1
-    return (
-        end
-        if end + 2 > len(data) or (data[end] == 0xA3 and data[end + 1] == 0x95)
-        else 0
-    )
+    if end + 2 > len(data):
+        return end
+    begins_next = data[end] == 0xA3 and data[end + 1] == 0x95
+    return end if begins_next else 0
 
 
 @compiled
@@ -541,7 +539,7 @@ def _start_utc(rows: Rows) -> int | None:
     new = {"GMS", "GWk", "TimeUS"} <= set(columns)
     if not new and not {"TimeMS", "Week", "T"} <= set(columns):
         return None
-    rows = rows[rows["Status"] >= _FIX] if "Status" in columns else rows
+    rows = rows[rows["Status"] >= GPS_FIX_3D] if "Status" in columns else rows
     week, ms = (
         rows[name].astype(np.int64)
         for name in (("GWk", "GMS") if new else ("Week", "TimeMS"))

@@ -69,14 +69,14 @@ _LOG_BATCH = 1 << 10
 _MOST_COMPARED = 16
 #: share of a log that must be read for a verdict on the whole of it
 LEAST_READ = 0.9
-#: messages that are named of a log without IMUs
-_MOST_NAMES = 6
 #: board and its serial number, as ArduPilot sends both at its start
 _BOARD = re.compile(r"[\w-]+ ([0-9A-F]{8} [0-9A-F]{8} [0-9A-F]{8})")
 #: parameter of ArduPilot with the device of a gyro
 _DEVICE_PARAMETER = re.compile(r"INS_GYR([23]?)_ID")
 #: ids of devices have 32 bits
 LARGEST_DEVICE = 1 << 32
+#: GPS status from which on the time is known, in logs of both autopilots: a fix in three dimensions
+GPS_FIX_3D = 3
 #: full throttle, by the message: 1, per cent, or thousandths in old logs
 _FULL = (1.0, 100.0, 1000.0)
 #: larger values are damage: throttles of old logs pass 1000 a little
@@ -574,7 +574,7 @@ class FlightLog(BagFile):
         if not there:
             most = ", ".join(
                 f"{count} {shown(name, 32)}"
-                for name, count in self.counts.most_common(_MOST_NAMES)
+                for name, count in self.counts.most_common(6)
             )
             return f" has no {' or '.join(self.kinds)}, it has {most or 'no records'}. What to do: {setting}"
         has = "; ".join((*there, *unread))

@@ -267,8 +267,6 @@ EXPECTED = (
 )
 #: first bytes of the placeholder that git-lfs leaves for a large file
 LFS = b"version https://git-lfs."
-#: recordings that a refusal names
-MOST_NAMED = 4
 #: key in the custom data of the metadata.yaml of an output bag
 MADE_BY_FDI = "fdi_ros"
 MOST_BESIDE = 4096
@@ -351,7 +349,7 @@ def _pieces_of_one(folder: Path) -> list[Path]:
     several = len(stems) > 1 or others
     if several and not (folder / "metadata.yaml").exists():
         found = [shown(path.name) for path in (*paths, *sorted(others))]
-        names = first_of(found, MOST_NAMED)
+        names = first_of(found, most=4)
         raise BagError(
             f"{folder} holds several recordings ({names}): name one of them, or run fdi fleet"
             " on the folder"

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_log import (
     FLU,
+    GPS_FIX_3D,
     LARGEST_DEVICE,
     SETTINGS,
     ImuSamples,
@@ -88,8 +89,6 @@ _HELD = {
     "gyro_clipping": "{high:.0f} samples clipped on an axis",
 }
 """Fields of vehicle_imu_status to report, with their format; none of zeros only."""
-#: fix_type from which on the time is known: a fix in three dimensions
-_FIX = 3
 
 
 class _Bounded(io.BytesIO):
@@ -457,7 +456,8 @@ def _unpacked(last: Int, columns: Columns) -> tuple[Int, Array]:
     before = size[:, None] - 1 - np.arange(room)
     spacing = columns["dt"].astype(np.float64)
     spacing = np.where((spacing > 0) & (spacing < 1e6), spacing, 0.0)
-    stamp = last[:, None] - np.round(before * spacing[:, None]).astype(np.int64)
+    earlier = np.round(before * spacing[:, None]).astype(np.int64)
+    stamp = last[:, None] - earlier
     rate = raw * columns["scale"].astype(np.float64)[:, None, None]
     return stamp[before >= 0], rate[before >= 0]
 
@@ -467,7 +467,7 @@ def _start_utc(columns: Columns) -> int | None:
     if not {"timestamp", "time_utc_usec"} <= columns.keys():
         return None
     fixed = (
-        columns["fix_type"] >= _FIX
+        columns["fix_type"] >= GPS_FIX_3D
         if "fix_type" in columns
         else np.ones(message_count(columns), dtype=bool)
     )

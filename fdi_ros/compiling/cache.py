@@ -51,7 +51,7 @@ from numba.core.caching import (
 from numba.core.runtime.nrt import rtsys
 
 from fdi_ros.system.files import (
-    OTHERS,
+    WRITABLE_BY_OTHERS,
     DistrustError,
     check_ancestor,
     check_trusted,
@@ -275,7 +275,7 @@ class Kept(_Files):
     def _open_for_write(self, filepath: str) -> Iterator[Any]:
         with super()._open_for_write(filepath) as file:
             mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
-            os.fchmod(file.fileno(), mode & ~OTHERS)
+            os.fchmod(file.fileno(), mode & ~WRITABLE_BY_OTHERS)
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -295,7 +295,7 @@ def check_as_package(path: Path) -> None:
             raise DistrustError(one, "it is a link")
         if about.st_uid not in (0, os.geteuid(), module.st_uid):
             raise DistrustError(one, f"it belongs to another user ({about.st_uid})")
-        more = about.st_mode & OTHERS & ~module.st_mode
+        more = about.st_mode & WRITABLE_BY_OTHERS & ~module.st_mode
         other_group = about.st_gid != module.st_gid and about.st_mode & stat.S_IWGRP
         if more or other_group:
             mode = stat.S_IMODE(about.st_mode)

@@ -97,7 +97,7 @@ real flights, where old evidence stands at its limit for up to 40 % of the time,
 refused cases are -1.5 to 0.1."""
 # Channels are named again when the time that is explained has grown by 1 / RENAME.
 RENAME = 16
-SETTLED, SETTLED_AMONG_FEW = 0.2, 0.5
+SETTLED_ALONE, SETTLED_AMONG_FEW = 0.2, 0.5
 SETTLED_TOGETHER = 2.0 * SETTLED_AMONG_FEW
 """Time that a name must stand before it is declared, s: one channel, one channel with at
 most `FEW_CHECKS` checks, two channels. Several faults look like one at first, and with
@@ -105,7 +105,7 @@ few checks three faults explain any mean."""
 CLEAR_ODDS = 5000.0
 """Log odds from which a single fault is named at once. A second error a twentieth as large
 would then show by five standard deviations, (0.05^2) 2 CLEAR = 25."""
-OTHERS, TURNED = 6.0, 0.3
+HEALTHY_SIGMAS, HEALTHY_SHARE = 6.0, 0.3
 """Largest rest of a healthy channel in a block, after the errors of the named channels: this
 many standard deviations, which noise does not reach in a flight, plus this share of the
 named error, because the axes are not exactly known."""
@@ -441,7 +441,8 @@ def block_shows_others(params: Constants, state: State, named: int, place: int) 
             count += 1
     invert(inference.matrix, count, inference.inverse)
     for j in range(n):
-        if not named >> j & 1 and kf.judged >> j & 1 and information[j, j] > 0.0:
+        is_other = (kf.judged & ~named) >> j & 1
+        if is_other and information[j, j] > 0.0:
             # regression on the named channels
             fill_correlations(information, j, named, inference.along)
             variance = 1.0
@@ -473,7 +474,7 @@ def shows_other(
             other -= state.case.inference.amplitude[p] * values[i]
             largest = max(largest, abs(values[i]))
             p += 1
-    return abs(other) > OTHERS * math.sqrt(variance) + TURNED * largest
+    return abs(other) > HEALTHY_SIGMAS * math.sqrt(variance) + HEALTHY_SHARE * largest
 
 
 @compiled
@@ -819,7 +820,7 @@ def time_to_settle(params: Constants, inference: Inference) -> float:
     if inference.log_odds >= CLEAR_ODDS:
         return 0.0
     if redundancy(inference.mask, params.sensors.n) > FEW_CHECKS:
-        return SETTLED
+        return SETTLED_ALONE
     return SETTLED_AMONG_FEW
 
 

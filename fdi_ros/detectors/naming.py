@@ -65,7 +65,7 @@ SHIFTS, SMALLEST_SHIFT = 5, 1.0 / 16.0
 """Number of sizes of a shift of all biases, and the smallest one, standard deviation over
 `Constants.largest_move`. Each further size is twice as large, up to 40 mrad/s of gyros: a
 boost of 10 g moves a gyro of 2 mrad/s a g by 20, and at its end by as much again."""
-RANGES = (0.125, 0.25, 0.5, 2.0, 4.0, 8.0)
+WRONG_GAINS = (0.125, 0.25, 0.5, 2.0, 4.0, 8.0)
 """Gains of a unit with a wrong range. Chips offer up to four ranges, each twice the one before, so the
 set one may be too large or too small by these. Each has its inverse here: of two units, one with a
 gain of 8 and the other one with 1/8 look alike. Without these hypotheses, while the axis of the turn
@@ -81,7 +81,7 @@ samples, and without this bound a turn that nothing shows stands beside its name
 MOST_HYPOTHESES = (
     MAX_CHANNELS
     + MAX_CHANNELS * (MAX_CHANNELS - 1) // 2
-    + (4 + len(RANGES)) * MAX_UNITS
+    + (4 + len(WRONG_GAINS)) * MAX_UNITS
     + SHIFTS
 )
 """Largest number of hypotheses: channels, pairs, ten for each unit, shifts of all biases."""
@@ -532,7 +532,7 @@ def add_ranges(
         return
     n = params.sensors.n
     known = factorise(inference.parity.normal, 3, inference.inverse)
-    for gain in RANGES:
+    for gain in WRONG_GAINS:
         set_range(params, inference, inside, gain)
         inference.fit = inference.total - rest_of_range(params, inference)
         shown = SHOWN_SHARE * min(gain, 1.0)
@@ -545,7 +545,7 @@ def add_ranges(
             reading += along(params.sensors.axes[i], inference.amplitude)
             inference.direction[0, i] = reading if inside >> i & 1 else 0.0
         inference.amplitude[0] = gain - 1.0
-        odds = prior - math.log(len(RANGES)) + inference.fit
+        odds = prior - math.log(len(WRONG_GAINS)) + inference.fit
         odds += 0.5 * (known - log_det) + 1.5 * math.log(gain)
         add(inference, n, 1, odds, inside, False)
 

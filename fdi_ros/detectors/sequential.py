@@ -118,6 +118,16 @@ vehicle may move differently."""
 LEAST_SCALE, LEAST_TIMING, LEAST_NONLINEARITY = 1e-3, 3e-4, 3e-4
 """Smallest believable standard deviations of any channel, even a calibrated one: scale
 error, sampling instant in s, and nonlinearity."""
+SAME_NAMES = (
+    "confidence",
+    "turn_on_std",
+    "bias_move",
+    "rectified",
+    "largest_move",
+    "gain_is_fault",
+    "louder",
+)
+"""Options of `Sequential` that its constants have under the same name."""
 # Largest ratio of statistic to threshold that is published while there is no alarm.
 SHORT = 1.0 - 1e-9
 
@@ -586,41 +596,33 @@ class Sequential(Detector):
         ).mean_run_length()
         self.sample_rate = 100.0 if sample_rate is None else sample_rate
         walk = np.broadcast_to(np.asarray(bias_walk, dtype=np.float64), geometry.n)
-        super().__init__(
-            geometry,
-            noise,
-            {
-                "run_length": self.run_length,
-                "sample_rate": self.sample_rate,
-                "confidence": confidence,
-                "bias_walk": float(walk.max()),
-                "turn_on_std": turn_on_std,
-                "bias_move": bias_move,
-                "rectified": rectified,
-                "largest_move": largest_move,
-                "shared_scale_std": shared_scale_std,
-                "g_sensitivity_std": g_sensitivity_std,
-                "delay_std": delay_std,
-                "gain_is_fault": gain_is_fault,
-                "louder": louder,
-            },
-        )
+        options = {
+            "run_length": self.run_length,
+            "sample_rate": self.sample_rate,
+            "confidence": confidence,
+            "bias_walk": float(walk.max()),
+            "turn_on_std": turn_on_std,
+            "bias_move": bias_move,
+            "rectified": rectified,
+            "largest_move": largest_move,
+            "shared_scale_std": shared_scale_std,
+            "g_sensitivity_std": g_sensitivity_std,
+            "delay_std": delay_std,
+            "gain_is_fault": gain_is_fault,
+            "louder": louder,
+        }
+        super().__init__(geometry, noise, options)
         self._fill_units()
         self._fill_times()
         self._fill_sets()
         self._fill_noise(walk, delay_std)
         params = self.constants[0]
         params["layout"]["shared_scale"] = shared_scale_std
-        params["gain_is_fault"] = gain_is_fault
-        params["louder"] = louder
-        params["rest_std"] = REST_STD
         params["g_sensitivity"] = g_sensitivity_std
-        params["turn_on_std"] = turn_on_std
-        params["bias_move"] = bias_move
-        params["rectified"] = rectified
-        params["largest_move"] = largest_move
         params["limit"] = self.run_length
-        params["confidence"] = confidence
+        params["rest_std"] = REST_STD
+        for name in SAME_NAMES:
+            params[name] = options[name]
 
     def _fill_noise(self, bias_walk: Array, delay_std: float) -> None:
         """Fill the error states and what the noise model says of the channels."""

@@ -295,8 +295,6 @@ MOST_TABLE_ROWS = 2000
 """Largest number of flights in a table of the page. flights.parquet has all."""
 LOOKS = 10
 """Largest number of flights with reasons that a terminal shows."""
-MOST_DAMAGED = 3
-"""Largest number of damaged recordings that a sentence names. The table has all."""
 
 
 class Fleet:
@@ -358,7 +356,7 @@ class Fleet:
         names = [row["path"].rpartition("/")[2] for row in self.judged if row["damage"]]
         damaged = (
             f"{_count(own['damaged'], 'recording')} could not be read whole:"
-            f" {shown(first_of(names, MOST_DAMAGED), LINE)}."
+            f" {shown(first_of(names, most=3), LINE)}."
         )
         assumed = (
             f"For {_count(own['not_measured'], 'flight')} the mounts and axes are assumed, not measured, so"

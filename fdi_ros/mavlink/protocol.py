@@ -155,9 +155,10 @@ def read(number: int, payload: bytes, zeros: bool = False) -> ImuSample | None:
     g = message.gyro
     unit = message.unit if message.unit_at < 0 else data[message.unit_at]
     stamp = 1000 * message.microseconds * time
-    return ImuSample(
-        unit, stamp, (g * gx, -g * gy, -g * gz), (a * ax, -a * ay, -a * az)
-    )
+    # from FRD to FLU
+    rate = (g * gx, -g * gy, -g * gz)
+    force = (a * ax, -a * ay, -a * az)
+    return ImuSample(unit, stamp, rate, force)
 
 
 def understood(kind: str, autopilot: int) -> bool:
@@ -170,7 +171,7 @@ def understood(kind: str, autopilot: int) -> bool:
 
 DEFAULT_INTERVAL = 0
 ACKNOWLEDGED_WITHIN = NS  #: An acknowledgement may take this time, ns.
-TRIES = 3
+TRIES = 3  #: Requests of one message until it has no answer.
 AGAIN = 10 * NS  #: Time after which a slow message is requested again, ns.
 AGAIN_REFUSED = 60 * NS  #: Time after which a refused message is requested again, ns.
 ENOUGH = 0.8  #: Share of the requested rate that is enough.
@@ -283,7 +284,7 @@ class Streams:
 DRIFT = 1e-4  #: Largest drift between two clocks.
 #: Rate at which the offset in use follows a better one. Stamps do not step.
 SLEW = 1e-3
-STEP = 20 * MS  #: A better offset further away is taken at once, ns.
+LARGEST_SLEW = 20 * MS  #: A better offset further away is taken at once, ns.
 GRAIN = MS  #: Largest step of the times in answers, ns.
 LONGEST_TRIP = NS  #: Longer round trips are ignored, ns.
 LATELY = 5 * NS  #: A link is as slow as its round trips of this time, ns.
@@ -387,7 +388,7 @@ class TimeSync:
         if wanted is None:
             return None
         used = self._used
-        if used is not None and abs(wanted - used) <= STEP:
+        if used is not None and abs(wanted - used) <= LARGEST_SLEW:
             most = SLEW * max(0, now - self._used_at)
             wanted = used + min(max(wanted - used, -most), most)
         self._used = wanted

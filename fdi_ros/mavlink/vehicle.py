@@ -45,14 +45,6 @@ from fdi_ros.mavlink.senders import Senders
 from fdi_ros.mavlink.signing import NO_TIMES, SigningTimes, Verifier, now_in_steps
 from fdi_ros.system import require
 
-HEARTBEAT, PARAM_VALUE, COMMAND_ACK, TIMESYNC = 0, 22, 77, 111
-STATUSTEXT = 253
-SET_MESSAGE_INTERVAL = 511  # MAV_CMD
-AUTOPILOT_COMPONENT = 1
-GROUND_STATION, ONBOARD_CONTROLLER = 6, 18  #: MAV_TYPE
-ACTIVE = 4  #: MAV_STATE
-ARMED = 128  #: MAV_MODE_FLAG
-REAL32 = 9  #: MAV_PARAM_TYPE. ArduPilot accepts any type.
 LOST_AFTER = 3 * NS  #: An autopilot is lost after this time without a message, ns.
 UNSYNCHRONISED = 2 * NS  #: Without TIMESYNC for this time, arrival stamps samples, ns.
 CHOICE = 3 * NS  #: Kinds of messages are compared for this time before the choice, ns.
@@ -197,6 +189,7 @@ class Vehicle:
         self.behind = 0.0  #: Age of the last signature that was too old, s.
         self._behind_from: Any = None
         self._mavlink = dialect()
+        self._component = self._mavlink.MAV_COMP_ID_AUTOPILOT1
         self._send = send
         self._seconds = seconds
         self._verifier = Verifier(settings.key, times) if settings.key else None
@@ -266,7 +259,7 @@ class Vehicle:
             # Of another dialect: the checksum depends on the unknown layout.
             self.counts["unknown"] += 1
             sender = (system, component, peer)
-            is_ours = sender == (self.system, AUTOPILOT_COMPONENT, self.peer)
+            is_ours = sender == (self.system, self._component, self.peer)
             if is_ours:
                 self._look_for_another(sequence, data, now)
             if is_ours and self._sequence == (sequence - 1) & 255:
@@ -286,7 +279,7 @@ class Vehicle:
         links of the autopilot.
         """
         verifier = self._verifier
-        may_be_heard = component == AUTOPILOT_COMPONENT and self.settings.system in (
+        may_be_heard = component == self._component and self.settings.system in (
             0,
             system,
         )
@@ -303,14 +296,20 @@ class Vehicle:
 
     def _hear(self, message: Any, number: int, is_new: bool, now: int) -> None:
         """Take an answer. is_new: it has overtaken no other message."""
-        if number == TIMESYNC:
+        mavlink = self._mavlink
+        if number == mavlink.MAVLINK_MSG_ID_TIMESYNC:
             self.sync.answer(message.ts1, message.tc1, now)
-        elif number == PARAM_VALUE and is_new:
+        elif number == mavlink.MAVLINK_MSG_ID_PARAM_VALUE and is_new:
             name = message.param_id.partition("\0")[0]
             self.parameters.append((name, message.param_value))
-        elif number == STATUSTEXT and (found := DENIED.match(message.text)):
+        elif number == mavlink.MAVLINK_MSG_ID_STATUSTEXT and (
+            found := DENIED.match(message.text)
+        ):
             self.denied.append(found[1])
-        elif number == COMMAND_ACK and message.command == SET_MESSAGE_INTERVAL:
+        elif (
+            number == mavlink.MAVLINK_MSG_ID_COMMAND_ACK
+            and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+        ):
             self.streams.acknowledged(message.result)
 
     def _parsed(self, peer: Any, data: bytes) -> list[Any]:
@@ -344,12 +343,13 @@ class Vehicle:
         now: int,
     ) -> bool:
         """Return whether the autopilot in use sent a message; a new one may come into use."""
-        is_autopilot = component == AUTOPILOT_COMPONENT
-        beats = is_autopilot and number == HEARTBEAT
+        mavlink = self._mavlink
+        is_autopilot = component == self._component
+        beats = is_autopilot and number == mavlink.MAVLINK_MSG_ID_HEARTBEAT
         beats = (
             beats
             and message.autopilot != NO_AUTOPILOT
-            and message.type != GROUND_STATION
+            and message.type != mavlink.MAV_TYPE_GCS
         )
         if (
             is_autopilot
@@ -386,7 +386,7 @@ class Vehicle:
         self.heard = now
         if beats:
             self.autopilot = message.autopilot
-            self.armed = bool(message.base_mode & ARMED)
+            self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
             self._disarmed_at = None if self.armed else self._disarmed_at or now
             self.disarmed = now - (self._disarmed_at or now)
         return True
@@ -530,9 +530,17 @@ class Vehicle:
 
     def tick(self, now: int) -> None:
         """Send due messages; called often."""
+        mavlink = self._mavlink
         if is_second := now - self._beat >= NS:
             self._beat = now
-            self._say("heartbeat", ONBOARD_CONTROLLER, NO_AUTOPILOT, 0, 0, ACTIVE)
+            self._say(
+                "heartbeat",
+                mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+                NO_AUTOPILOT,
+                0,
+                0,
+                mavlink.MAV_STATE_ACTIVE,
+            )
         if self._found and not self._lost and now - self.heard > LOST_AFTER:
             self._lost = True
             self.events.append(
@@ -543,8 +551,8 @@ class Vehicle:
         if (sent := self.sync.request(now)) is not None:
             self._say("timesync", 0, sent)
         if (request := self.streams.due(now)) is not None:
-            fields = (SET_MESSAGE_INTERVAL, 0, *request, 0, 0, 0, 0, 0)
-            self._say("command_long", self.system, AUTOPILOT_COMPONENT, *fields)
+            fields = (mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *request, 0, 0, 0, 0, 0)
+            self._say("command_long", self.system, self._component, *fields)
         if is_second:
             self._check_rates(now)
             if self.streams.refused(SCALED) and understood("RAW_IMU", self.autopilot):
@@ -568,14 +576,17 @@ class Vehicle:
 
     def read_parameter(self, name: str) -> None:
         """Request a parameter; its value arrives in `parameters`."""
-        self._say(
-            "param_request_read", self.system, AUTOPILOT_COMPONENT, name.encode(), -1
-        )
+        self._say("param_request_read", self.system, self._component, name.encode(), -1)
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter; the autopilot reports the new value."""
         self._say(
-            "param_set", self.system, AUTOPILOT_COMPONENT, name.encode(), value, REAL32
+            "param_set",
+            self.system,
+            self._component,
+            name.encode(),
+            value,
+            self._mavlink.MAV_PARAM_TYPE_REAL32,  # ArduPilot accepts any type.
         )
 
     def send_value(self, name: str, value: float, now: int) -> None:

@@ -20,12 +20,14 @@ from fdi_ros.model.quantity import FORCE
 from fdi_ros.monitor.output import Topic
 from fdi_ros.monitor.soundness import (
     DECLARED,
+    MOST_CONCERNS,
     Concern,
     Trouble,
     Word,
     live_word,
     units_in_both_halves,
 )
+from fdi_ros.monitor.status import CERTAIN_SIGMAS
 from fdi_ros.system.text import figures, first_of, percent, plus_minus, shown
 
 if TYPE_CHECKING:
@@ -44,13 +46,9 @@ FAR_FROM_NOW = 1.0
 OLD = 86400.0
 """Delay behind the clock from which on stamps probably belong to a recording, s."""
 OLD_WORDS = " (of a recording? then use_sim_time, and a player that gives the clock)"
-CERTAIN_DELAY = 4.0
-"""Smallest delay between units that is reported, in standard deviations."""
 LEAST_DELAY = 0.001
 """Smallest delay that is reported, s. Drivers often differ by less, which makes an error of
 0.01 rad/s at an angular acceleration of 10 rad/s^2."""
-MOST_CONCERNS = 3
-"""Largest number of concerns in the line about the monitor."""
 NEARLY = 0.8
 """Share of ``bias.max_drift`` from which on a drift is reported. Above 1 it is a fault."""
 
@@ -223,19 +221,21 @@ def describe(
         )
         words += f"; {warning}" if warning else ""
         rows = [(name, Level.STALE, words, values) for name, _, _, values in rows]
-    rows += [
-        (
-            f"{INPUT}{line.name}",
-            *_input_message(line, _words_about_input(line.name, concerns)),
-            _input_values(line),
-        )
-        for line in inputs
-    ]
+    rows += [_input_row(line, concerns) for line in inputs]
     hardware = status.config.hardware_id
     return [
         StatusLine(level, prefix + name, message, hardware, values)
         for name, level, message, values in rows
     ]
+
+
+def _input_row(
+    line: InputStatus, concerns: Sequence[Concern]
+) -> tuple[str, Level, str, Values]:
+    """Return the line about an input topic."""
+    about = _words_about_input(line.name, concerns)
+    level, message = _input_message(line, about)
+    return f"{INPUT}{line.name}", level, message, _input_values(line)
 
 
 def _words_about_input(name: str, concerns: Sequence[Concern]) -> list[str]:
@@ -269,7 +269,7 @@ def _find_worse(status: Status) -> dict[str, list[str]]:
         if not one.is_left_out
     }
     for unit in status.units:
-        if abs(unit.delay) > max(CERTAIN_DELAY * unit.delay_std, LEAST_DELAY):
+        if abs(unit.delay) > max(CERTAIN_SIGMAS * unit.delay_std, LEAST_DELAY):
             side = "late" if unit.delay > 0 else "early"
             off = "; the monitor corrects this" if unit.taken_off else ""
             size = f"{1e3 * abs(unit.delay):.1f} +- {1e3 * unit.delay_std:.1f} ms"

@@ -34,8 +34,6 @@ NO_LEVEL: Axes = (math.inf,) * 3
 
 MIN_LEFT = 1e-3  # smallest singular value of S_LL. Below, L reaches no residual, or its channels cannot be told apart
 MIN_SPREAD = 1e-9  # residuals with less than this share of the channel's standard deviation are rounding
-# bisections of an interval: the level is too large by 1e-9 of the interval at most
-_HALVINGS = 30
 _erfc = np.frompyfunc(math.erfc, 1, 1)
 
 
@@ -150,7 +148,8 @@ class Integrity:
         if not spans_space(axes):
             return nothing
         root = 1 / np.sqrt(self._noise[kept])
-        gain = np.asarray(np.linalg.pinv(axes * root[:, None]) * root, dtype=np.float64)
+        scaled = np.linalg.pinv(axes * root[:, None])
+        gain = np.asarray(scaled * root, dtype=np.float64)
         residual = np.eye(len(kept)) - axes @ gain
         parts = residual**2 * variance
         spread = np.sqrt(parts.sum(axis=1))
@@ -177,7 +176,8 @@ class Integrity:
         level = _solve(sigma, prior, modes, self.risk)
         share = np.zeros((len(mask), 3))
         if np.isfinite(level).all():
-            share[kept] = _share(level, gain**2 * variance / sigma[:, None] ** 2, modes)
+            portions = gain**2 * variance / sigma[:, None] ** 2
+            share[kept] = _share(level, portions, modes)
         return ProtectionLevel(level, limit, share)
 
 
@@ -259,7 +259,8 @@ def _solve(sigma: Array, prior: Array, modes: _Modes, risk: float) -> Array:
     reach = normal_isf(min(budget / 2, 0.5))
     low = np.zeros(3)
     high = np.vstack([limits + reach * sigmas, reach * sigma]).max(axis=0)
-    for _ in range(_HALVINGS):
+    # Too large by 1e-9 of the interval at most, after 30 halvings.
+    for _ in range(30):
         middle = 0.5 * (low + high)
         above = missed(middle) > budget
         low = np.where(above, middle, low)

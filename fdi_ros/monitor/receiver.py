@@ -286,18 +286,13 @@ class Receiver:
         clear_disagreements(path.core)
 
 
-_FEW_CHANNELS = 5  # channels for a method that does not take six
-
-
 def warm_detector(name: str) -> None:
     """Compile or load the code of one detector. Raise `DetectorError` for an unknown name."""
     method = detector_class(name)
     for one in vars(sys.modules[method.__module__]).values():
         if isinstance(one, Callback):
             _ = one.address
-    geometry = (
-        Geometry.cone(_FEW_CHANNELS) if method.refuses(6) else Geometry.two_triad_cone()
-    )
+    geometry = Geometry.cone(5) if method.refuses(6) else Geometry.two_triad_cone()
     create_detector(name, geometry, NoiseModel(0.01, bound=0.04)).detect(
         np.zeros((1, geometry.n))
     )

@@ -45,7 +45,7 @@ LEAST_READINGS = 10
 LEAST_RESIDUALS = 30
 """Smallest number of residuals for a comparison of noise."""
 USUAL_QUANTILE = 0.9
-"""Quantile of the rates of a unit that is its usual rate."""
+"""Quantile of the rates of a unit that is its usual rate, even if the unit is slow for long."""
 MOST_RATES = 600
 """Largest number of rates of a unit, from which its usual rate follows."""
 

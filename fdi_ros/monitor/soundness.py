@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 DECLARED = (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
 """States of a channel in a declared fault, named or in a set."""
+MOST_CONCERNS = 3
+"""Largest number of concerns in a verdict or in the line about the monitor."""
 LEAST_CHECKED = 0.5
 """Share of its values that the others must have checked of a healthy channel."""
 LEAST_DELIVERED = 0.9
@@ -249,10 +251,6 @@ def advice_on(concerns: Iterable[Concern]) -> str:
     return "; ".join(trouble.advice(who) for trouble, who in by_trouble.items())
 
 
-PASSES = 20
-"""Iterations of `own_noise`. It converges by more than a factor of two in each."""
-
-
 def own_noise(residual: Array, axes: Array) -> Array:
     """Return the standard deviation of the errors of each channel, (n,), rad/s.
 
@@ -280,7 +278,8 @@ def own_noise(residual: Array, axes: Array) -> Array:
     left = _left_by_fit(own, variance)
     share = np.maximum(np.diag(left), LEAST_VISIBLE_SHARE)
     least = LEAST_OF_VISIBLE * share
-    for _ in range(PASSES):
+    # It converges by more than a factor of two in each pass.
+    for _ in range(20):
         square = np.einsum("ij,jk,ik->i", left, covariance, left)
         variance = np.maximum(np.sqrt(variance * square / share), LEAST_RESIDUAL**2)
         left = _left_by_fit(own, variance)

@@ -39,7 +39,6 @@ SAVED_CHANGE = 2.0
 """Errors are saved again once one differs from its saved value by this many
 standard deviations, or is known this many times better. A smaller change is covered by
 the random walk that is added for the age of the file when it is restored."""
-DIGITS = 9  # of the figures saved
 SAVE_RETRY = 1.0  # time until a failed save is tried again, s
 
 
@@ -118,7 +117,7 @@ def _errors(detector: Detector) -> dict[str, Array] | None:
 def _as_json(figures: Array) -> list[float]:
     """Return figures in the form of the file. Covariances are lower triangles."""
     values = figures if figures.ndim == 1 else figures[np.tril_indices(len(figures))]
-    return [float(f"{one:.{DIGITS}g}") for one in values]
+    return [float(f"{one:.9g}") for one in values]
 
 
 def _differs(state: dict[str, Any], kept: dict[str, Any] | None) -> bool:

@@ -37,11 +37,11 @@ from fdi_ros.model.samples import Array, Mask
 from fdi_ros.monitor.integrity import NO_LEVEL, Axes, Integrity
 from fdi_ros.system.text import listed, plus_minus
 
-# standard deviations from which two channels of a larger set surely differ
-CERTAIN_DIFFERENCE = 4.0
+CERTAIN_SIGMAS = 4.0
+"""Standard deviations from which a measured delay, difference or trend is certain: by chance 1 in 16 000."""
 LOST_STATES = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
 SCALE_PARTS = ("scale x", "scale y", "scale z")  # kinds of `ErrorStatus`
-LEAST_SCALE = 0.04
+LEAST_SCALE_ERROR = 0.04
 """Scale error against the others that is reported, a share. In 20 recordings of healthy vehicles
 it is 0.013 at most; data sheets of consumer IMUs allow 0.03."""
 CERTAIN = 2.0  # standard deviations by which it is beyond that
@@ -280,7 +280,7 @@ class Status:
     def certain_scale_error(self, channel: ChannelStatus) -> float:
         """Return how much more a channel reads than the rate or force along its axis, as a share.
 
-        0 if that is not certain to `CERTAIN` standard deviations beyond `LEAST_SCALE`.
+        0 if that is not certain to `CERTAIN` standard deviations beyond `LEAST_SCALE_ERROR`.
         """
         parts = [
             (error.value, error.std)
@@ -295,7 +295,7 @@ class Status:
         std = math.hypot(
             *(a * std for a, (_, std) in zip(channel.axis, parts, strict=True))
         )
-        return value if abs(value) > LEAST_SCALE + CERTAIN * std else 0.0
+        return value if abs(value) > LEAST_SCALE_ERROR + CERTAIN * std else 0.0
 
     def turn_on_std(self, channel: ChannelStatus) -> float:
         """Return the standard deviation of a bias from one start to the next, in the channel's unit."""
@@ -519,7 +519,9 @@ def _units(
     geometry = guard.geometry
     measured = len(late) > 0
     names = _unit_names(geometry)
-    middle = int(np.argsort(late[:, 0])[(len(late) - 1) // 2]) if len(late) > 2 else 0
+    middle = 0
+    if len(late) > 2:
+        middle = int(np.argsort(late[:, 0])[(len(late) - 1) // 2])
     off = guard.states[0]["estimator"]["late"] if measured else np.zeros(len(names))
     return tuple(
         UnitStatus(
@@ -624,7 +626,7 @@ def _apart(guard: Detector, core: Any, quantity: Quantity) -> ApartStatus | None
         elif len(group) > 2:
             continue
         certainty = size / std if std > 0.0 else math.inf
-        if certainty > largest and (len(group) == 2 or certainty >= CERTAIN_DIFFERENCE):
+        if certainty > largest and (len(group) == 2 or certainty >= CERTAIN_SIGMAS):
             names = geometry.channel_names[a], geometry.channel_names[b]
             found = ApartStatus(
                 names,

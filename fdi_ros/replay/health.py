@@ -19,6 +19,7 @@ from fdi_ros.bag.samples import steps_of
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.recent import USUAL_QUANTILE
 from fdi_ros.monitor.soundness import UnitHealth, own_noise
 
 MOST_WINDOWS = 4096
@@ -27,8 +28,6 @@ FIRST_WINDOW = 1.0
 """Length of a window at first, s."""
 MESSAGES_IN_WINDOW = 20.0
 """Smallest mean number of messages in a window for a rate."""
-USUAL_QUANTILE = 0.9
-"""Quantile of the counts of a unit that is its usual count, even if the unit is slow for long."""
 USUAL_SHARE = 0.9
 """Share of the usual count from which on a window counts for the usual rate."""
 SLOW_SHARE = 0.6

@@ -20,7 +20,7 @@ from fdi_ros.report.layout import FINE, PageStore
 
 SPAN = 1.0
 """Time over which a residual is averaged, s."""
-MOST_SPANS = 2000
+MOST_STORED = 2000
 """Largest number of spans of a recording that the page has."""
 
 
@@ -42,7 +42,7 @@ class OwnEvidence:
 
     def __init__(self, geometry: Geometry, noise_std: Array, names: list[str]) -> None:
         #: the evidence of each channel over the time of the recording
-        self.store = PageStore(dict.fromkeys(names, FINE), MOST_SPANS)
+        self.store = PageStore(dict.fromkeys(names, FINE), MOST_STORED)
         #: largest evidence of any channel
         self.peak = 0.0
         self._axes = geometry.axes

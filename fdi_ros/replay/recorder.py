@@ -35,6 +35,7 @@ from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.quantity import RATE, Quantity
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.output import Output
+from fdi_ros.monitor.status import CERTAIN_SIGMAS
 from fdi_ros.replay.episodes import (
     LONGEST_HOLE_S,
     MOST_STEPS,
@@ -440,7 +441,8 @@ class Recorder:
             if {a, b} <= one.members:
                 both = np.isin(np.arange(len(axes)), (a, b)).astype(np.float64)
                 scale = float(axes[a] @ axes[b]) / float(axes[b] @ axes[b])
-                add((a, b), both, residual[:, a] - scale * residual[:, b])
+                difference = residual[:, a] - scale * residual[:, b]
+                add((a, b), both, difference)
 
     def _apart(self, one: _Open) -> Apart | None:
         """Return the pair on one axis whose difference is most significant. None: no pair differs."""
@@ -458,7 +460,7 @@ class Recorder:
         )
         if (
             set(pair) != one.members
-            and abs(size.rad_s) < CERTAIN_TREND * size.std_rad_s
+            and abs(size.rad_s) < CERTAIN_SIGMAS * size.std_rad_s
         ):
             return None
         names = tuple(self._geometry.channel_names[i] for i in pair)
@@ -549,14 +551,12 @@ def _stds(output: Output) -> Array:
 
 MOST_BATCHES = 512
 """Largest number of batches. If exceeded, neighbours are merged."""
-FIRST_WIDTH = 0.1
+FIRST_BATCH_S = 0.1
 """Width of a batch at first, s."""
 LONGER = 12
 """Number of merged batches for the standard error. An error is correlated for a shorter time."""
 FEWEST_BATCHES = 4
 """Smallest number of batches with a meaningful scatter."""
-CERTAIN_TREND = 4.0
-"""Standard errors from which on a trend is significant."""
 TREND = 0.3
 """Smallest change of a trend, as a share of the size."""
 PASSED = 0.25
@@ -566,7 +566,7 @@ SIZE_TIME = 1.0
 stay below `PASSED` to be over."""
 ROUNDING_SHARE = 1e-12
 """Share of a mean square that is rounding error."""
-SMALL = 0.5
+SMALL_MEAN = 0.5
 """Ratio of mean to scatter below which the error is not described by its mean."""
 LOUD = 3.0
 """Ratio of scatter to expected noise from which on an error is noise."""
@@ -594,7 +594,7 @@ class Batches:
         self._noise = noise
         self._scale = scale
         self._bias = bias
-        self._width = FIRST_WIDTH
+        self._width = FIRST_BATCH_S
         # Number of samples, sum, sum of squares of each batch.
         self._sums = np.zeros((3, MOST_BATCHES))
         self._with_rate = np.zeros(
@@ -666,16 +666,15 @@ class Batches:
             error = math.hypot(_standard_error(part, scatter, samples_then), lasting)
             return Size(float(part.mean()), error, "gone", last, gone_s=round(gone, 3))
         slope = _trend(middle, mean)
-        if slope is not None and abs(slope) * (middle[-1] - middle[0]) > TREND * abs(
-            whole
-        ):
+        change = 0.0 if slope is None else abs(slope) * (middle[-1] - middle[0])
+        if slope is not None and change > TREND * abs(whole):
             course: Course = "growing" if slope * (then or whole) > 0 else "shrinking"
             straight = mean - slope * (middle - middle.mean())
             chance = float(straight.std(ddof=2)) / math.sqrt(len(here))
             return Size(then, math.hypot(chance, lasting), course, last, slope)
-        if abs(whole) < SMALL * math.sqrt(scatter):
+        if abs(whole) < SMALL_MEAN * math.sqrt(scatter):
             wander = float(mean.var()) if len(mean) >= FEWEST_BATCHES else 0.0
-            if wander > max(0.5 * scatter, (CERTAIN_TREND * std) ** 2):
+            if wander > max(0.5 * scatter, (CERTAIN_SIGMAS * std) ** 2):
                 return Size(rms, std, "varying", last)
             if scatter > (LOUD * self._noise) ** 2:
                 return Size(rms, rms / math.sqrt(2.0 * samples), "noisy", last)
@@ -713,4 +712,4 @@ def _trend(time: Array, mean: Array) -> float | None:
     slope = float(x @ mean / (x @ x))
     rest = mean - mean.mean() - slope * x
     std = math.sqrt(float(rest @ rest) / (len(mean) - 2) / float(x @ x))
-    return slope if abs(slope) > CERTAIN_TREND * std else None
+    return slope if abs(slope) > CERTAIN_SIGMAS * std else None

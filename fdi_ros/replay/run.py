@@ -74,8 +74,6 @@ ConfigSource = Config | Source | None
 """Settings, or a parameter file. None: the settings that ``fdi inspect`` writes."""
 PORTION = 16384
 """Largest number of samples that are judged at once, which bounds the memory for their outputs."""
-LAST_SAMPLES = 1_000_000_000
-"""A channel delivers to the end if its last value is this close to the last sample, ns."""
 
 
 class Sink:
@@ -229,8 +227,9 @@ class Judge(Walk):
         block = self.pipeline.arranged(block)
         if len(block) > 1:
             self._intervals.append((float(np.median(np.diff(block.stamp))), len(block)))
-        for i in np.flatnonzero(np.isfinite(block.z).any(axis=0)).tolist():
-            self._delivered[i] = block.stamp[np.isfinite(block.z[:, i])][-1]
+        there = np.isfinite(block.z)
+        for i in np.flatnonzero(there.any(axis=0)).tolist():
+            self._delivered[i] = block.stamp[there[:, i]][-1]
         faulty = self.injector.apply(block)
         for values, half in zip(self._values, faulty.halves, strict=True):
             values.add(half.z)
@@ -443,7 +442,8 @@ class Judge(Walk):
         A corrected delay or the end of a log leaves some units without the last samples.
         """
         last = self.evaluation.last
-        delivered = self._delivered[self._delivered >= last - LAST_SAMPLES]
+        to_end = round(SILENT_TO_END * 1e9)
+        delivered = self._delivered[self._delivered >= last - to_end]
         return round(self.evaluation.time(int(delivered.min(initial=last))), 9)
 
     @property

@@ -27,9 +27,9 @@ from fdi_ros.replay.warming import LARGEST_SLOPE, Warming, fit_warming
 
 MOST_SPANS = 512
 """Largest number of spans. If exceeded, neighbours are merged."""
-FIRST_WIDTH = 1.0
+FIRST_SPAN_S = 1.0
 """Width of a span at first, s. Temperatures of chips change more slowly."""
-LEAST_DELIVERED = 0.9
+LEAST_FILLED = 0.9
 """Share of the samples of a span that a channel must have for a mean. In motion, means of other
 samples are means of other rates."""
 LEAST_COVERED = 0.5
@@ -55,7 +55,7 @@ class SpanMeans:
         self._quantity = quantity
         self._begin = np.nan
         """Begin of the first span, s from the first message."""
-        self._width = FIRST_WIDTH
+        self._width = FIRST_SPAN_S
         self._counts = np.zeros((geometry.n, MOST_SPANS))
         self._totals = np.zeros((geometry.n, MOST_SPANS))
 
@@ -134,7 +134,7 @@ class SpanMeans:
         inside = (middle >= part.start_s) & (middle <= part.end_s)
         spans = spans[inside]
         counts = self._counts[:, spans]
-        enough = counts >= LEAST_DELIVERED * most[spans]
+        enough = counts >= LEAST_FILLED * most[spans]
         means = np.full(counts.shape, np.nan)
         means[enough] = self._totals[:, spans][enough] / counts[enough]
         return np.asarray(middle[inside], dtype=np.float64), means.T

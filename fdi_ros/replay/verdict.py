@@ -13,6 +13,7 @@ from collections.abc import Collection, Sequence
 
 from fdi_ros.core.states import Reason
 from fdi_ros.monitor.soundness import (
+    MOST_CONCERNS,
     Concern,
     Trouble,
     Word,
@@ -41,9 +42,8 @@ from fdi_ros.system.text import figures, first_of, listed, percent
 LEAST_JUDGED = 0.5
 """Share of the samples that must be judged for a verdict."""
 SILENT_TO_END = 1.0
-"""Time to the end for which a channel must be silent or unchecked to be reported, s."""
-MOST_CONCERNS = 3
-"""Reasons that a verdict lists."""
+"""Time to the end for which a channel must be silent or unchecked to be reported, s. A channel with a later
+value delivers to the end."""
 
 
 def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:

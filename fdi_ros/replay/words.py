@@ -14,7 +14,7 @@ from fdi_ros.faults.fault import ACCELEROMETERS
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import UNUSED_COUNTERS
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
-from fdi_ros.monitor.soundness import Concern, Trouble, UnitHealth, Word
+from fdi_ros.monitor.soundness import MOST_CONCERNS, Concern, Trouble, UnitHealth, Word
 from fdi_ros.replay.episodes import (
     MOST_TOLD,
     Episode,
@@ -26,7 +26,6 @@ from fdi_ros.replay.episodes import (
 from fdi_ros.replay.outcomes import Outcome, Scores
 from fdi_ros.replay.summary import ChannelResult, SampleRate, Summary
 from fdi_ros.replay.verdict import (
-    MOST_CONCERNS,
     SILENT_TO_END,
     noise_behind,
     set_clocks,

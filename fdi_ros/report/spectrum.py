@@ -21,7 +21,7 @@ PIECE = 512
 """Samples of each averaged spectrum."""
 SAMPLES_AT_ONCE = 16 * PIECE
 """Samples that are transformed at once."""
-STANDS_OUT = 4.0
+LINE_HEIGHT = 4.0
 """Smallest ratio of a line to its baseline."""
 
 
@@ -61,7 +61,8 @@ class Spectrum:
         if not known:
             return None
         frequency = np.fft.rfftfreq(PIECE, 1.0 / self._rate)[1:]
-        density = np.sqrt(self._power[1:, known] / self._weight[known]) * unit.factor
+        power = self._power[1:, known] / self._weight[known]
+        density = np.sqrt(power) * unit.factor
         data = [
             {
                 "type": "scatter",
@@ -103,8 +104,9 @@ class Spectrum:
         step = self._rate / PIECE
         # The median of 31 frequencies is the baseline of a line.
         around = median_filter(density, size=(31, 1), mode="nearest")
-        peaks, about = find_peaks((density / around).max(axis=1), height=STANDS_OUT)
-        found = [(peaks[k] + 1) * step for k in np.argsort(-about["peak_heights"])[:3]]
+        peaks, about = find_peaks((density / around).max(axis=1), height=LINE_HEIGHT)
+        highest = np.argsort(-about["peak_heights"])[:3]
+        found = [(peaks[k] + 1) * step for k in highest]
         words = []
         if found:
             lines = ", ".join(

@@ -30,8 +30,6 @@ from fdi_ros.monitor.diagnostics import Level, StatusLine, encode_diagnostics
 from fdi_ros.monitor.receiver import warm_codec
 from fdi_ros.ros.node import CheckedNode
 
-LOOK_PERIOD = 0.05  # period of the checks for the first subscriber of an output, s
-
 
 class InjectorNode(CheckedNode):
     """Republishes the input topics of a monitor with faults. Raise `FdiError` if a parameter or a fault is wrong.
@@ -63,7 +61,7 @@ class InjectorNode(CheckedNode):
                 k,
                 self.create_output(self._source.type, topic + suffix),
             )
-        self._look_timer = self.every(LOOK_PERIOD, self._look)
+        self._look_timer = self.every(0.05, self._look)
         self._diagnostics = self.create_diagnostics()
         self.create_timer(1.0, self._report)
         self._switch(self.values())

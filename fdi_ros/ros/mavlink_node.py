@@ -66,7 +66,6 @@ WAIT = 0.02  #: Longest wait for the link between two turns of the executor, s.
 #: Suffix of topics of the injector, the monitor's inputs on a bench.
 INJECTED = "_faulty"
 PARTING = 4.0  #: Longest wait at the end, on the ground, until IMUs are put back, s.
-MOST_CALLS = 32  #: Largest number of callbacks in a turn of the executor.
 _SEND_EVERY = 10_000_000  # interval at which due messages are sent, ns
 # largest diagnostics that are read, bytes; twelve channels take 10 000
 _LARGEST = 1 << 17
@@ -241,7 +240,7 @@ class AutopilotNode(CheckedNode):
             self._turn()
 
     def _give_turn(self, executor: Any) -> None:
-        for _ in range(MOST_CALLS):
+        for _ in range(32):
             self._called = False
             executor.spin_once(timeout_sec=0.0)
             if not self._called:

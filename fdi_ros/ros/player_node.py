@@ -30,7 +30,6 @@ from fdi_ros.ros.node import CheckedNode
 from fdi_ros.ros.process import Stop, guarded
 
 PATIENCE = 0.1  # a request, or a signal, waits at most this long for its answer, s
-SETTLING = 0.3  # time for the subscribers that were found to have found the player, s
 LONGEST_STEP, DISORDER = (
     60.0,
     1.0,
@@ -109,7 +108,7 @@ class PlayerNode(CheckedNode):
         if (lacking := self._without_subscriber()) and not stop.asked:
             self.log.warning(f"no subscriber to {lacking}: playing all the same")
         # A publisher sees a subscriber a moment before the subscriber can receive.
-        time.sleep(SETTLING if not stop.asked else 0)
+        time.sleep(0.3 if not stop.asked else 0)
 
     def _play_once(self, stop: Stop, spin: Callable[[float], None]) -> bool:
         """Play the recording.

@@ -24,7 +24,6 @@ from fdi_ros.errors import ConfigError, FdiError
 from fdi_ros.signals import heeded
 from fdi_ros.system import BAGS, require
 
-LONGEST_SPIN = 0.1  # longest turn of the executor, s, which delays a signal. The EventsExecutor needs a limit to work
 ROS_ARGUMENTS = (
     "--params-file",
     "--param",
@@ -68,7 +67,8 @@ def spin(node: Any, stop: Stop) -> None:
     try:
         while rclpy.ok() and not stop.asked:
             with guarded(node):
-                executor.spin_once(timeout_sec=LONGEST_SPIN)
+                # A turn delays a signal. The EventsExecutor needs a limit to work.
+                executor.spin_once(timeout_sec=0.1)
                 if single:
                     node.inputs.drain()
                 else:

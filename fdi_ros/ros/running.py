@@ -50,7 +50,6 @@ from fdi_ros.monitor.status import ApartStatus, Status
 from fdi_ros.ros.node import OVERRIDABLE, REPORT_PERIOD, BoundedLog, CheckedNode
 from fdi_ros.system.text import LINE, figures, shown
 
-KEPT_LATENCIES = 4096  # samples whose latency is remembered
 MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood
 LATE_SAMPLE = 0.5
 """Age from which the newest judged sample is reported, s: several times the time that the slowest link and the
@@ -317,7 +316,7 @@ class Running:
             for output in OUTPUTS
         }
         self._diagnostics = node.create_diagnostics()
-        self._latencies: deque[int] = deque(maxlen=KEPT_LATENCIES)
+        self._latencies: deque[int] = deque(maxlen=4096)
         self.start(receiver)
 
     def start(self, receiver: Receiver) -> None:

@@ -46,7 +46,7 @@ from fdi_ros.system.text import figures, percent
 
 #: Smallest share of usable samples of an accelerometer, relative to the median of all
 #: (counted as at least this share, too).
-LEAST_USABLE = 0.3
+LEAST_OF_USUAL = 0.3
 #: largest angle between the specific forces of two units, rad: swapped or reversed axes
 #: make more
 LARGEST_TURN = float(np.radians(30.0))
@@ -178,7 +178,7 @@ def _check_amount(data: Data, names: Sequence[str]) -> None:
             f"{len(names)} accelerometers are in use, expected at least 4"
         )
     usual = float(np.median(share))
-    if (least := float(share.min())) < LEAST_USABLE * max(usual, LEAST_USABLE):
+    if (least := float(share.min())) < LEAST_OF_USUAL * max(usual, LEAST_OF_USUAL):
         raise CalibrationError(
             f"{names[int(share.argmin())]} gives a usable value in {percent(least)} of the samples"
         )
@@ -194,7 +194,9 @@ def _check_forces(z: Array, units: Sequence[str], unit: Int, axes: Array) -> Non
     if len(whole) < 2 or len(rows) < 1:
         return
     columns = [unit == k for k in whole]
-    forces = np.array([rows[:, one] @ np.linalg.inv(axes[one]).T for one in columns])
+    inverses = [np.linalg.inv(axes[own]) for own in columns]
+    pairs = zip(columns, inverses, strict=True)
+    forces = np.array([rows[:, own] @ inverse.T for own, inverse in pairs])
     sizes = np.linalg.norm(forces, axis=2)
     size = np.median(sizes, axis=1)
     others = np.array([np.median(np.delete(size, k)) for k in range(len(size))])
@@ -215,7 +217,8 @@ def _check_forces(z: Array, units: Sequence[str], unit: Int, axes: Array) -> Non
     cosine = np.median(np.einsum("jna,kna->jkn", directions, directions), axis=2)
     mean = (cosine.sum(axis=1) - 1.0) / (len(whole) - 1)
     odd = int(mean.argmin())
-    angle = float(np.arccos(np.clip(np.max(np.delete(cosine[odd], odd)), -1.0, 1.0)))
+    nearest = np.max(np.delete(cosine[odd], odd))
+    angle = float(np.arccos(np.clip(nearest, -1.0, 1.0)))
     if angle > LARGEST_TURN:
         raise DisagreementError(
             f"the accelerometers of {units[whole[odd]]} measure a specific force {np.degrees(angle):.0f} deg from"

@@ -71,7 +71,7 @@ UNKNOWN_MOUNT = 0.58
 #: the same of an array, and the error from which axes follow the motion alone
 UNKNOWN_AXES = 0.1
 #: s, samples, and s from one to the next
-LEAST_DURATION, LEAST_SAMPLES, LONGEST_STEP = (
+LEAST_DURATION, LEAST_SAMPLES, LONGEST_INTERVAL = (
     10.0,
     100,
     1.0,
@@ -306,8 +306,8 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
         words = f"is {data.duration:.1f} s long, a calibration needs at least {LEAST_DURATION:g} s"
     elif samples < LEAST_SAMPLES:
         words = f"has {samples} samples, a calibration needs at least {LEAST_SAMPLES}"
-    elif data.step > LONGEST_STEP:
-        words = f"has a sample every {data.step:g} s, a calibration needs one every {LONGEST_STEP:g} s"
+    elif data.step > LONGEST_INTERVAL:
+        words = f"has a sample every {data.step:g} s, a calibration needs one every {LONGEST_INTERVAL:g} s"
     if words:
         raise CalibrationError(f"the recording {words}")
     for i, name in enumerate(names):
@@ -367,7 +367,8 @@ def _sensors(
     if not source.units and len(means) >= LEAST_WINDOWS:
         x = means[:, chosen]
         found = np.linalg.lstsq(x, means, rcond=None)[0].T @ axes[chosen]
-        turns = np.sqrt(np.linalg.eigvalsh(x.T @ x / len(x))[0]) >= LEAST_ROTATION
+        least = np.linalg.eigvalsh(x.T @ x / len(x))[0]
+        turns = np.sqrt(least) >= LEAST_ROTATION
         if turns and np.abs(found - axes).max() > UNKNOWN_AXES:
             axes = found
             scale = np.full(nominal.n, UNKNOWN_AXES)
@@ -376,9 +377,9 @@ def _sensors(
         others = [i for i in range(nominal.n) if i not in lost]
         rate = means[:, others] @ np.linalg.pinv(axes[others]).T
         weak = max(len(means), 1) * LEAST_RATE**2 * np.eye(3)
-        axes[lost] = np.linalg.solve(
-            rate.T @ rate + weak, rate.T @ means[:, lost] + weak @ axes[lost].T
-        ).T
+        normal = rate.T @ rate + weak
+        right = rate.T @ means[:, lost] + weak @ axes[lost].T
+        axes[lost] = np.linalg.solve(normal, right).T
     scale[chosen] = REFERENCE_STD
     scale[lost] = UNKNOWN_MOUNT
     # Channels that belong to no unit are of the first.

@@ -91,7 +91,7 @@ MOST_VIBRATION = 4.0
 USUAL_WALK = 2e-5
 #: Smallest number of blocks for the noise of a window, and of windows for the colour of
 #: the noise; number of blocks in each mean that shows the colour.
-LEAST_BLOCKS = LEAST_WINDOWS = SUBS = 5
+LEAST_BLOCKS = COLOUR_WINDOWS = SUBS = 5
 #: Number of base signals: one, the rate (3), and the angular acceleration (3).
 BASE = 7
 #: Estimated kinds of error states. Their signals are linear in the base signals.
@@ -514,9 +514,8 @@ class _Pass:
             right[k] = flat @ weighted.reshape(-1)
         since = (self.middle - self.middle.mean())[:, None, None]
         rates = since * normal[:, :n]
-        whole = np.block(
-            [[normal, np.swapaxes(rates, 1, 2)], [rates, since**2 * normal[:, :n, :n]]]
-        )
+        squares = since**2 * normal[:, :n, :n]
+        whole = np.block([[normal, np.swapaxes(rates, 1, 2)], [rates, squares]])
         return whole, np.hstack([right, since[:, 0] * right[:, :n]])
 
     def _beyond_vibration(self, moments: Array, count: Int) -> Array:
@@ -536,7 +535,8 @@ class _Pass:
         beyond = np.where(there, np.maximum(variance - at_rest, 0.0), 0.0)
         share = (beyond / variance).max(axis=1)[:, None]
         most = np.zeros((len(moments), BASE))
-        most[:, 1:4] = (self.axes**2 * beyond[:, :, None]).max(axis=1) / UNEQUAL**2
+        along = self.axes**2 * beyond[:, :, None]
+        most[:, 1:4] = along.max(axis=1) / UNEQUAL**2
         # Differences of two blocks hold at most half of the power.
         most[:, 4:7] = (
             0.5 * most[:, 1:4].max(axis=1, keepdims=True) / self.blocks.length**2
@@ -576,7 +576,7 @@ class _Pass:
         full &= np.logical_and.reduceat(self.used, blocks.start)
         for regime, windows in enumerate((full & self.rest, full & ~self.rest)):
             chosen = np.flatnonzero(windows)
-            if len(chosen) < LEAST_WINDOWS:
+            if len(chosen) < COLOUR_WINDOWS:
                 continue
             rows = blocks.start[chosen][:, None] + np.arange(REST_BLOCKS)
             t = np.einsum(

@@ -35,6 +35,7 @@ from fdi_ros.monitor.accelerometers import (
 from fdi_ros.monitor.building import UNIT_DELAY, build_geometry
 from fdi_ros.setup.blocks import Blocks, make_blocks, prepare
 from fdi_ros.setup.estimate import (
+    LEAST_BLOCKS,
     SCALE_STD,
     USUAL_WALK,
     StateEstimate,
@@ -57,15 +58,13 @@ SHOWN_POSITION = 0.01
 #: weights of a block and its neighbours: the mean force then lasts as long as the
 #: difference of two rates, to second order
 SMOOTHING = np.array([1.0, 4.0, 1.0]) / 6.0
-#: fewest blocks of a window in use, and fewest such windows
-LEAST_BLOCKS = LEAST_WINDOWS = 5
+#: fewest windows of at least `LEAST_BLOCKS` blocks in use
+LEAST_TURNING = 5
 #: angular acceleration over its noise, in power, from which a window turns
 TURNING_POWER = 3.0
-#: fits, each with the noise that the one before left in every window
-ROUNDS = 3
 #: Numbers of states: the walking bias; and bias, position (3), scale and mount errors
 #: (9) and delay together.
-BIASES, STATES = 3, 16
+BIAS_COUNT, STATE_COUNT = 3, 16
 
 
 class Position(NamedTuple):
@@ -182,7 +181,7 @@ class _ForceEvidence:
     `FORCE.natural`.
     """
 
-    #: (B, 3, STATES) change of each force with the bias and with the states
+    #: (B, 3, STATE_COUNT) change of each force with the bias and with the states
     signals: Array
     #: (B, 3) difference of the forces, 0 where unknown
     difference: Array
@@ -190,9 +189,9 @@ class _ForceEvidence:
     good: Mask
     #: (W,) blocks in use
     count: Int
-    #: (W, STATES, STATES) sums of products of signals, without those of noise
+    #: (W, STATE_COUNT, STATE_COUNT) sums of products of signals, without those of noise
     moments: Array
-    #: (W, STATES) sums of products of signals and difference
+    #: (W, STATE_COUNT) sums of products of signals and difference
     cross: Array
 
     @property
@@ -208,7 +207,7 @@ def _windows_of(
     # The difference has other noise than the mean.
     difference = _smooth(other - first)
     mean = _smooth(0.5 * (first + other))
-    signals = np.zeros((len(mean), 3, STATES))
+    signals = np.zeros((len(mean), 3, STATE_COUNT))
     signals[:, :, :3] = np.eye(3)
     signals[:, :, 3:6] = turning / FORCE.natural
     signals[:, :, 6:15] = np.kron(np.eye(3), mean[:, None, :]).reshape(-1, 3, 9)
@@ -265,7 +264,7 @@ def _position(
     """
     blocks = found.blocks
     evidence = _windows_of(first, other, turning, noise, blocks)
-    if evidence.known.sum() < LEAST_WINDOWS:
+    if evidence.known.sum() < LEAST_TURNING:
         return np.zeros(3), np.full(3, POSITION_STD)
     prior = np.concatenate(
         [
@@ -280,15 +279,16 @@ def _position(
     middle = np.add.reduceat(blocks.time, groups) / in_group
     apart = np.diff(middle, append=middle[-1])
     residual = evidence.difference
-    for number in range(ROUNDS):
+    # Three fits, each with the noise that the one before left in every window.
+    for number in range(3):
         weight = _weights(evidence, residual, number > 0, blocks.start)
         of = NormalEquations(
-            BIASES,
+            BIAS_COUNT,
             np.add.reduceat(weight[:, None, None] * evidence.moments, groups),
             np.add.reduceat(weight[:, None] * evidence.cross, groups),
             apart,
             prior,
-            np.zeros(STATES),
+            np.zeros(STATE_COUNT),
         )
         walk = find_random_walk(of)
         fitted = smooth(of, walk.value or min(walk.possible, USUAL_WALK))

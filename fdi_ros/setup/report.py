@@ -34,6 +34,7 @@ from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array
 from fdi_ros.monitor.soundness import LEAST_DRIFT_RAD_S, Trouble
 from fdi_ros.replay.sweep_report import declared_figures
+from fdi_ros.replay.verdict import LEAST_JUDGED
 from fdi_ros.report.layout import (
     FORCES,
     RADIANS,
@@ -61,9 +62,9 @@ from fdi_ros.setup.mounting import fault_sections, pair_lines
 from fdi_ros.setup.positions import SHOWN_POSITION
 from fdi_ros.setup.run import (
     FORCE_SIZES,
-    SIZES,
+    NAMED_WITHIN,
+    TEST_SIZES,
     TIMES,
-    WITHIN,
     SetupResult,
     Tried,
     times_words,
@@ -98,8 +99,6 @@ LARGE_SWING, LARGE_BIAS = (
 LARGE_FORCE = 1.0
 #: size of test faults, rad/s, and the share to be found
 FLOOR, LEAST_NAMED = 0.1, 0.9
-#: share of the samples that a monitor should judge
-LEAST_JUDGED = 0.5
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 NOISE_HINT = (
     "Standard deviation of one sample, averaged over 5 s, vibration included."
@@ -704,7 +703,8 @@ def _isolation_words(tried: Tried, unit: Unit) -> str:
     isolated, biases = tried.isolated_of
     if not biases:
         return ""
-    low, floor, high = (f"{x * unit.factor:.3g}" for x in (SIZES[0], FLOOR, SIZES[-1]))
+    sizes = (TEST_SIZES[0], FLOOR, TEST_SIZES[-1])
+    low, floor, high = (f"{size * unit.factor:.3g}" for size in sizes)
     words = f" Of {biases} test faults added there ({low} to {high} {unit.name}),"
     if not isolated:
         return f"{words} none was isolated: a faulty gyro may be detected without being identified."
@@ -713,7 +713,7 @@ def _isolation_words(tried: Tried, unit: Unit) -> str:
     if named >= LEAST_NAMED * of:
         return words
     words += f" Of {of} with {floor} {unit.name}, {named} were isolated"
-    largest, among = tried.isolated[SIZES[-1]]
+    largest, among = tried.isolated[TEST_SIZES[-1]]
     if largest >= LEAST_NAMED * among:
         return f"{words}: expect to identify the faulty gyro only of larger faults."
     words += (
@@ -942,12 +942,12 @@ def _tried(found: SetupResult, unit: Unit = RADIANS) -> list[Column]:
         "-" if one.baseline is None else times_words(one.declared) or "nothing"
         for one in both
     ]
-    shares = [[one.isolated.get(size, (0, 0)) for size in SIZES] for one in both]
+    shares = [[one.isolated.get(size, (0, 0)) for size in TEST_SIZES] for one in both]
     isolated = [
         [{"size": s, "isolated": n, "tried": m} for s, (n, m) in one.isolated.items()]
         for one in both
     ]
-    heads = [f"{size * unit.factor:.3g} {unit.name} isolated" for size in SIZES]
+    heads = [f"{size * unit.factor:.3g} {unit.name} isolated" for size in TEST_SIZES]
 
     def share_words(share: tuple[int, int]) -> str:
         return f"{share[0]} of {share[1]}" if share[1] else "-"
@@ -1020,7 +1020,7 @@ def _sections(
     result = found.calibration
     first = verdict_of(findings)
     hint = f"Replays of {proof.source}: one has no fault. In each of the others a bias begins on one channel,"
-    hint += f" at one of {TIMES} moments. Isolated: that channel alone is declared within {WITHIN:g} s."
+    hint += f" at one of {TIMES} moments. Isolated: that channel alone is declared within {NAMED_WITHIN:g} s."
     bag = shlex.quote(bag)
     config = shlex.quote(config)
     is_bad = first.severity is Severity.BAD

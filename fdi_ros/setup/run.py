@@ -63,22 +63,22 @@ from fdi_ros.setup.mounting import Mounting, assess
 from fdi_ros.system.text import first_of, percent, shown
 
 #: biases of gyros tried, rad/s, and of accelerometers, m/s^2
-SIZES = (0.03, 0.1, 0.3)
+TEST_SIZES = (0.03, 0.1, 0.3)
 FORCE_SIZES = (0.3, 1.0, 3.0)
 #: size from which on biases of accelerometers count in a comparison, m/s^2: healthy ones
 #: move by 0.6 m/s^2 as vibration begins or ends
 FORCE_FLOOR = 1.0
 #: s in which they are to be isolated, and how often each is tried
-WITHIN, TIMES = (
+NAMED_WITHIN, TIMES = (
     4.0,
     2,
 )
-#: fewer biases isolated than before that are chance: one at the edge of `WITHIN`
+#: fewer biases isolated than before that are chance: one at the edge of `NAMED_WITHIN`
 CHANCE = 1
 #: part kept aside, and its bounds, s: all biases have room
-KEPT, LEAST_KEPT, MOST_KEPT = (
+KEPT_ASIDE, LEAST_KEPT, MOST_KEPT = (
     0.25,
-    TIMES * WITHIN,
+    TIMES * NAMED_WITHIN,
     120.0,
 )
 #: s that must be left to calibrate on
@@ -118,7 +118,9 @@ class Tried:
 
 def _of_all_sizes(isolated: Mapping[float, tuple[int, int]]) -> tuple[int, int]:
     """Return the number of biases isolated, and tried, of all sizes."""
-    return sum(n for n, _ in isolated.values()), sum(n for _, n in isolated.values())
+    found = sum(count for count, _ in isolated.values())
+    tried = sum(count for _, count in isolated.values())
+    return found, tried
 
 
 def times_words(declared: Mapping[str, float]) -> str:
@@ -182,10 +184,10 @@ def _tried(block: Block, config: Config, start: float) -> Tried:
 
     ``start``: time of the block, s from the first message.
     """
-    faults = [f"kind=bias size={size:g}" for size in SIZES]
+    faults = [f"kind=bias size={size:g}" for size in TEST_SIZES]
     faults += [f"channel={FORCES} kind=bias size={size:g}" for size in FORCE_SIZES]
     plan = Plan(
-        tuple(one for text in faults for one in parse_swept(text)), TIMES, WITHIN
+        tuple(one for text in faults for one in parse_swept(text)), TIMES, NAMED_WITHIN
     )
     one = Subject("settings", config, block, start=start)
     try:
@@ -418,7 +420,7 @@ def _kept_from(block: Block) -> tuple[float, float] | None:
         return None
     steps = np.diff(block.stamp) * 1e-9
     lasts = np.cumsum(np.minimum(steps, GAP_INTERVALS * np.median(steps)))
-    kept = float(np.clip(KEPT * lasts[-1], LEAST_KEPT, MOST_KEPT))
+    kept = float(np.clip(KEPT_ASIDE * lasts[-1], LEAST_KEPT, MOST_KEPT))
     if lasts[-1] - kept < LEAST_LEFT:
         return None
     return float(np.cumsum(steps)[np.searchsorted(lasts, lasts[-1] - kept)]), kept

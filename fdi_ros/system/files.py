@@ -102,7 +102,7 @@ def max_unpacked_bytes(size: int) -> int:
 # What is believed -----------------------------------------------------------------------------------------------------
 
 #: bits of the mode by which others can write
-OTHERS = stat.S_IWGRP | stat.S_IWOTH
+WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 class DistrustError(OSError):
@@ -123,7 +123,7 @@ def check_trusted(path: Path | str, about: os.stat_result | None = None) -> None
         raise DistrustError(path, "it is a link")
     if about.st_uid not in (0, os.geteuid()):
         raise DistrustError(path, f"it belongs to another user ({about.st_uid})")
-    if about.st_mode & OTHERS:
+    if about.st_mode & WRITABLE_BY_OTHERS:
         raise DistrustError(
             path, f"others can write it (mode {stat.S_IMODE(about.st_mode):o})"
         )
@@ -137,11 +137,15 @@ def close_to_others(folder: Path | str) -> None:
     """
     about = os.lstat(folder)
     if (
-        about.st_mode & OTHERS
+        about.st_mode & WRITABLE_BY_OTHERS
         and about.st_uid == os.geteuid()
         and stat.S_ISDIR(about.st_mode)
     ):
-        os.chmod(folder, stat.S_IMODE(about.st_mode) & ~OTHERS, follow_symlinks=False)
+        os.chmod(
+            folder,
+            stat.S_IMODE(about.st_mode) & ~WRITABLE_BY_OTHERS,
+            follow_symlinks=False,
+        )
         about = os.lstat(folder)
     check_trusted(folder, about)
 
@@ -226,7 +230,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             with contextlib.suppress(OSError):
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.fchmod(
-                file.fileno(), stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~OTHERS
+                file.fileno(),
+                stat.S_IMODE(os.fstat(file.fileno()).st_mode) & ~WRITABLE_BY_OTHERS,
             )
             yield file
             file.flush()

@@ -60,7 +60,7 @@ def verdicts():
     """Of all variants of all detectors, after fewer trials at their making than usual; and how many alarms."""
     parts, alarms = [], 0
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(single_fault, "TRIALS", 2)
+        patch.setattr(single_fault, "TRIALS_PER_CHANNEL", 2)
         for name, options in VARIANTS:
             for noise in (
                 NoiseModel(1e-3, bound=1e-3),

@@ -23,13 +23,13 @@ from fdi_ros.detectors.naming import (
     FIT,
     FIT_PER_CHECK,
     GAIN_STD,
-    RANGES,
     SHIFTED,
     SHIFTED_AMONG_FEW,
     SHIFTS,
     SHOWN_SHARE,
     SMALLEST_SHIFT,
     TWO_CHECKS,
+    WRONG_GAINS,
     Inference,
     add_channels,
     add_shifts,
@@ -176,7 +176,7 @@ def take_ranges(mean, inside, prior, found):
         return rate, -0.5 * (chi_square.item() + log_det)
 
     healthy = log_likelihood(1.0)[1]
-    for gain in RANGES:
+    for gain in WRONG_GAINS:
         rate, log_density = log_likelihood(gain)
         # Neither unit would show so little of the turn.
         smaller = min(gain, 1.0) * np.linalg.norm(rate)
@@ -185,7 +185,7 @@ def take_ranges(mean, inside, prior, found):
         # A prior that is flat in the rate times the root of the gain.
         explained = log_density - healthy + 1.5 * np.log(gain)
         channels = mask_of(np.flatnonzero(inside))
-        found.append((channels, 0, np.log(prior / len(RANGES)) + explained))
+        found.append((channels, 0, np.log(prior / len(WRONG_GAINS)) + explained))
 
 
 def random_mean(seed, n):

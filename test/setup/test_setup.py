@@ -35,7 +35,7 @@ from fdi_ros.report.layout import RADIANS
 from fdi_ros.setup.agreement import find_mounts
 from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.report import _looks_of_proof, _worth
-from fdi_ros.setup.run import SIZES, Proof, Tried
+from fdi_ros.setup.run import TEST_SIZES, Proof, Tried
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -639,7 +639,7 @@ def test_a_unit_that_may_be_the_cause_is_advised_on_alone() -> None:
 
 def not_better(stuck):
     """New settings that are not kept, and the channels that they declare as stuck."""
-    none = dict.fromkeys(SIZES, (0, 18))
+    none = dict.fromkeys(TEST_SIZES, (0, 18))
     return SimpleNamespace(
         disagree=None,
         calibration=object(),

@@ -54,7 +54,8 @@ def _pairs(unit: Array) -> Array:
     index = np.array(list(combinations(range(len(unit)), 2)))
     a, b = unit[index.T]
     dependent = np.linalg.norm(np.cross(a, b), axis=1) < ROUNDING
-    values = np.column_stack([np.ones(len(index)), -np.sign((a * b).sum(axis=1))])
+    sign = np.sign((a * b).sum(axis=1))
+    values = np.column_stack([np.ones(len(index)), -sign])
     return _scatter(index[dependent], values[dependent], len(unit))
 
 
@@ -63,9 +64,8 @@ def _triples(unit: Array) -> Array:
     a, b, c = unit[index.T]
     dependent = np.abs((a * np.cross(b, c)).sum(axis=1)) < ROUNDING
     # In a plane with unit normal N: (b x c . N) a + (c x a . N) b + (a x b . N) c = 0.
-    products = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)[
-        dependent
-    ]
+    products = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    products = products[dependent]
     longest = np.linalg.norm(products, axis=2).argmax(axis=1)
     normal = products[np.arange(len(products)), longest]
     values = (products * normal[:, None, :]).sum(axis=2)
@@ -114,7 +114,7 @@ MOST_CIRCUITS = math.comb(MOST_CHANNELS, 4)
 MOST_LIMITS = math.comb(MOST_CHANNELS - 1, 3)
 NO_CHANNEL = MOST_CHANNELS  #: In place of a channel, with weight zero.
 #: A check up to this multiple of its bound is not violated: rounding is no fault.
-WITHIN = 1 + ROUNDING
+UP_TO_ROUNDING = 1 + ROUNDING
 
 
 # The method
@@ -191,7 +191,7 @@ def explain(params: Circuits, found: Findings) -> int:
     found.violations = found.explanations = 0
     ruled_out = 0
     for k in range(params.circuits):
-        if abs(found.value[k]) > WITHIN:
+        if abs(found.value[k]) > UP_TO_ROUNDING:
             ruled_out |= params.rules_out[k]
             # The worst in front rejects most explanations at once.
             worst = found.violated[0]
@@ -237,7 +237,8 @@ def intervals(params: Circuits, found: Findings) -> None:
         for faulty in (True, False):
             for m in range(found.explanations):
                 f = found.explains[m]
-                if (params.members[f, 0] == i or params.members[f, 1] == i) != faulty:
+                holds = params.members[f, 0] == i or params.members[f, 1] == i
+                if holds != faulty:
                     continue
                 high = math.inf if faulty else params.bound[i]
                 low = -high
@@ -294,7 +295,7 @@ def judge(
     """Judge one sample by its checks, and if these imply a fault, by all explanations."""
     verdict.statistic = check(params, sample.z, found)
     verdict.threshold = params.limit
-    if verdict.statistic < min(WITHIN, params.limit):
+    if verdict.statistic < min(UP_TO_ROUNDING, params.limit):
         return
     explain(params, found)
     if found.violations and params.faults:
@@ -406,7 +407,7 @@ class Guaranteed(Detector):
         params = self.constants[0]
         params["bound"][: geometry.n] = self.bound
         params["threshold"] = threshold
-        params["limit"] = threshold if self.max_faults else WITHIN
+        params["limit"] = threshold if self.max_faults else UP_TO_ROUNDING
         checks = circuits(geometry.axes)
         checks /= (np.abs(checks) * self.bound).sum(axis=1)[:, None]
         self._prepare_checks(checks)

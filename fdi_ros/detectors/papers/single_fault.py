@@ -72,7 +72,7 @@ def largest_form_threshold(
     )
 
 
-TRIALS, TRIAL_FAULT, TRIAL_NOISE = 200, 50.0, 1.5
+TRIALS_PER_CHANNEL, TRIAL_FAULT, TRIAL_NOISE = 200, 50.0, 1.5
 """Trials per channel, and size of faults and noise in the trials, in noise_std. The fault is
 by far the larger part. More noise than assumed finds too many rivals rather than too few."""
 
@@ -188,7 +188,7 @@ class SingleFaultDetector(Detector):
         noise = (
             TRIAL_NOISE
             * self.noise.noise_std
-            * np.random.default_rng(n).standard_normal((TRIALS, n))
+            * np.random.default_rng(n).standard_normal((TRIALS_PER_CHANNEL, n))
         )
         found = self._suspects.copy()
         for channel in np.flatnonzero(self.geometry.detectable):
