@@ -76,6 +76,9 @@ ALIKE_SHARES = 0.2
 MOST_ALIKE = 0.85
 #: A larger share was no error of scale, but one at rest, too.
 MOST_SHARE = 1.2
+#: The same with the range of the driver set wrong: 2000 deg/s in place of 250 reads 8 times the
+#: rate, an error of 7 times the rate.
+MOST_RANGE_SHARE = 7.0
 STEP = 1.25  #: Ratio of two steps in which the file keeps how an IMU was bad.
 TINY = 1e-3  #: Resolution of the messages, rad/s.
 #: An axis moves if its mean rate and the one of another IMU change alike, by this or more, rad/s. A
@@ -633,6 +636,7 @@ class Evidence:
         ]
         agreeing = [k for k in fit if self._agree(unit, k, doubted)]
         contradicted = self._contradicted(unit, partners) if is_out else set()
+        hides = is_out and self._hides(unit, partners)
         if agreeing:
             track.agreed_at = now
         if now - track.agreed_at > BREAK:
@@ -643,6 +647,8 @@ class Evidence:
             # these axes is needed once the two agree.
             track.wrong = dict.fromkeys(contradicted, WITHOUT_SCALE) | track.wrong
             track.shown -= contradicted
+            track.turned = track.turned and track.turned + elapsed
+        elif hides:
             track.turned = track.turned and track.turned + elapsed
         elif agreeing:
             track.agreed = track.agreed or now
@@ -845,6 +851,21 @@ class Evidence:
             for axis, size in enumerate(self._pairs[unit, k].apart)
             if size >= self._min_size
         }
+
+    def _hides(self, unit: int, partners: Collection[int]) -> bool:
+        """Return whether a scale error could hide in the difference to a partner.
+
+        The IMU may still have the error of scale that it had on this axis, if a partner that
+        is not named differs by as much as a turn about other axes explains. Agreement with
+        another partner then proves nothing: that one may have failed alike.
+        """
+        return any(
+            self._pairs[unit, k].full[axis] >= self._min_size
+            for k in partners
+            if ChannelState.FAULTY not in self._tracks[k].states
+            for axis, wrong in self._tracks[unit].wrong.items()
+            if wrong.share <= MOST_RANGE_SHARE
+        )
 
     def _voters(self, unit: int, units: Sequence[int]) -> list[int]:
         """Return the two other IMUs, if they may outvote one, or none.

@@ -16,7 +16,7 @@ from fdi_ros.core.states import ChannelState
 from fdi_ros.mavlink.failover_evidence import UNKNOWN, WITHOUT_SCALE, Evidence, Wrong
 from fdi_ros.mavlink.failover_policy import Imu, PolicySettings, is_reserve
 from fdi_ros.mavlink.failover_raw import RawComparison, Rows
-from mavlink.watched_flights import WatchedFlight, begin
+from mavlink.watched_flights import WatchedFlight
 
 MS = 1_000_000
 NS = 1000 * MS
@@ -890,6 +890,22 @@ def test_one_that_has_healed_shows_that_beside_one_that_never_sent() -> None:
     assert not imus[0].waits
 
 
+def test_an_error_of_scale_may_hide_in_a_turn_about_another_axis() -> None:
+    """The two read twice the rate about y. That is less than what scales explain about x."""
+
+    def turning_about_both(t: float) -> np.ndarray:
+        return np.array([2.2, 0.12, 0.0]) * (1.0 + 0.1 * math.sin(2.0 * t))
+
+    watched = without_scale(2.0)
+    watched.gyros[1] = scaled(2.05)
+    watched.states = [OK] * 9
+    watched.run(1.0).rate = turning_about_both
+    assert {watched.step()[0].waits for _ in range(400)} == {"y"}
+    watched.gyros[:2] = [sound, sound]
+    watched.run(1.0)
+    assert not watched.run(2.0).step()[0].waits
+
+
 def test_agreement_with_an_axis_that_the_monitor_doubts_shows_nothing() -> None:
     """While the third one differs, in whatever way."""
     watched = without_scale()
@@ -1492,7 +1508,14 @@ def test_a_random_flight_is_right_by_the_true_errors(seed: int) -> None:
 @pytest.mark.parametrize("seed", [41003, 41039])
 def test_two_that_lose_scale_alike_never_take_the_third_out(seed: int) -> None:
     """The node is started anew in these flights, in which the healthy IMU once went out."""
-    assert begin(seed).fly()["out of use"] == 1
+    flight = WatchedFlight(seed, are_similar=True, is_anew=True)
+    assert flight.fly()["out of use"] == 1
+
+
+def test_two_that_read_twice_the_rate_never_take_the_third_out() -> None:
+    """A fast turn about other axes once hid the error of the first, and it got its vote back."""
+    flight = WatchedFlight(323, are_similar=True, more=1.5)
+    assert flight.fly()["out of use"] == 1
 
 
 def test_an_imu_is_not_blamed_for_the_error_of_another_that_has_healed() -> None:

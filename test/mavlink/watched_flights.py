@@ -5,7 +5,8 @@
 or some of them: `python -m mavlink.watched_flights 400 600`.
 
 Three gyros measure a random motion, and fail at random. In every second flight two of them lose
-similar parts of their scale in turn. In the last two of four, the node is started anew. The
+similar parts of their scale in turn, in the last four of eight they read about twice the rate.
+In the last two of four, the node is started anew. The
 monitor judges what the gyros send; `Evidence` and the policy judge both, and the vehicle obeys
 at once. Every order, and every moment without one, is checked against the true errors of the
 gyros. `mavlink.flights` has the link, the autopilot and other stations.
@@ -90,12 +91,17 @@ def fail(random: np.random.Generator, t: np.ndarray, rates: np.ndarray) -> np.nd
     return failed
 
 
-def lose_scale(random: np.random.Generator, t: np.ndarray, gyros: np.ndarray) -> None:
-    """Let two gyros lose similar parts of their scale on one axis, one some seconds after the other."""
+def lose_scale(
+    random: np.random.Generator, t: np.ndarray, gyros: np.ndarray, more: float
+) -> None:
+    """Let two gyros lose similar parts of their scale on one axis, one some seconds after the other.
+
+    more: added to both scales. From 1.5 on they read about twice the rate.
+    """
     first, second = random.permutation(3)[:2]
     axis = random.integers(3)
     begin = random.uniform(ARMED_AT + 3.0, ARMED_AT + 7.0)
-    share = random.uniform(0.4, 0.8)
+    share = random.uniform(0.4, 0.8) + more
     gyros[t >= begin, first, axis] *= share
     begin += random.uniform(3.0, 8.0)
     gyros[t >= begin, second, axis] *= share + random.uniform(-0.1, 0.1)
@@ -112,8 +118,8 @@ def averaged(values: np.ndarray) -> np.ndarray:
 class WatchedFlight:
     """One flight: the samples, the true errors, and the checks.
 
-    are_similar: two gyros lose similar parts of their scale, instead of random faults. is_anew: the
-    node is started anew in flight.
+    are_similar: two gyros lose similar parts of their scale, instead of random faults. more: added
+    to both scales. is_anew: the node is started anew in flight.
     """
 
     def __init__(
@@ -122,13 +128,14 @@ class WatchedFlight:
         seconds: float = 60.0,
         are_similar: bool = False,
         is_anew: bool = False,
+        more: float = 0.0,
     ) -> None:
         self.random = random = np.random.default_rng(seed)
         self.t = t = np.arange(0.0, seconds, INTERVAL / NS)
         truth = motion(random, t)
         gyros = np.repeat(truth[:, None], 3, axis=1)
         if are_similar:
-            lose_scale(random, t, gyros)
+            lose_scale(random, t, gyros, more)
         for _ in range(0 if are_similar else random.integers(1, 5)):
             k = random.integers(3)
             gyros[:, k] = fail(random, t, gyros[:, k])
@@ -248,7 +255,12 @@ class WatchedFlight:
 
 def begin(seed: int) -> WatchedFlight:
     """Return a flight of the kind that belongs to its number."""
-    return WatchedFlight(seed, are_similar=seed % 2 == 1, is_anew=seed % 4 >= 2)
+    return WatchedFlight(
+        seed,
+        are_similar=seed % 2 == 1,
+        is_anew=seed % 4 >= 2,
+        more=1.5 if seed % 8 >= 4 else 0.0,
+    )
 
 
 if __name__ == "__main__":
