@@ -154,6 +154,26 @@ def test_what_a_stream_does_not_take_is_dropped_whole() -> None:
     link.close()
 
 
+def test_a_new_connection_begins_with_a_whole_message() -> None:
+    """The rest of a message that the last connection did not take belongs to nobody."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = open_link(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        clock = Clock(link)
+        clock.read(lambda _: not link.trouble)
+        peer, _ = server.accept()
+        while not link.dropped:
+            link.send(bytes(100), None)
+        peer.close()
+        clock.read(lambda _: bool(link.trouble))
+        clock.read(lambda _: not link.trouble)
+        peer, _ = server.accept()
+        with peer:
+            link.send(b"whole", None)
+            peer.settimeout(5.0)
+            assert peer.recv(100) == b"whole"
+    link.close()
+
+
 def test_a_serial_line_that_is_pulled_out_is_opened_again(tmp_path) -> None:
     pytest.importorskip("serial", reason="serial lines need pyserial")
     name = tmp_path / "autopilot"
