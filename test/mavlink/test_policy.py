@@ -57,10 +57,10 @@ def test_the_pause_counts_from_our_order_where_the_agreement_is_older():
     assert not tick(OUT, START + FIRST_PAUSE, use=False, agreed=agreed).held
 
 
-def reported(memory, first, last):
-    """Memory after reports of an IMU in use, every 20 ms from one time to another."""
+def reported(memory, first, last, use=True):
+    """Memory after reports of an IMU in use or not, every 20 ms from one time to another."""
     for now in range(first, last, 20 * MS):
-        memory = tick(memory, now, use=True)
+        memory = tick(memory, now, use=use)
     return memory
 
 
@@ -74,6 +74,16 @@ def test_a_late_answer_to_a_read_is_nobodys_hand_and_a_later_one_is():
     begin = START + STALE_ANSWER
     assert not reported(OUT, begin, begin + CHANGE_STANDS - 20 * MS).left_alone
     assert reported(OUT, begin, begin + CHANGE_STANDS + 40 * MS).left_alone
+
+
+def test_a_late_answer_after_our_order_back_is_nobodys_hand_either():
+    """The order is obeyed and reported at once, and then comes what was read before it."""
+    earlier = START - 20 * 1000 * MS
+    back = replace(OUT, ours=False, held=False, seen=True, out_sent=earlier)
+    back = replace(back, back_sent=START)
+    begin, stands = START + 20 * MS, START + STALE_ANSWER + CHANGE_STANDS
+    assert not reported(back, begin, stands - 40 * MS, use=False).left_alone
+    assert reported(back, begin, stands + 40 * MS, use=False).left_alone
 
 
 def on_the_ground(memory, now, *, named=False, use=False, boots=0, turned=True):
