@@ -100,3 +100,23 @@ def test_gyros_without_accelerations_are_judged_as_before():
         for std in (0.0, SENSITIVITY)
     ]
     assert rows[0] == rows[1]
+
+
+@pytest.mark.parametrize(("seconds", "counts"), [(0.3, False), (0.6, True)])
+def test_biases_move_only_with_a_force_that_lasts_for_half_a_second(seconds, counts):
+    """A landing or a gust is over before, and the biases are known as well as ever."""
+    block, _ = flight(1000)
+    time = np.arange(1000) / RATE
+    push = 3.0 * GRAVITY * ((time >= BEGINS) & (time < BEGINS + seconds))
+    felt = block.acceleration.z + np.tile(np.outer(push, [0.0, 0.0, 1.0]), 3)
+    pushed = replace(block, acceleration=Block(block.stamp, felt))
+    pipeline = Pipeline(settings(noise__g_sensitivity_std=SENSITIVITY))
+    pipeline.sense(range(3))
+    std = []
+    for rows in (slice(0, 798), slice(798, 798 + round(seconds * RATE))):
+        pipeline.process(pushed[rows])
+        std.append(pipeline.core["sample"]["estimate"]["bias_std"][0, :9].copy())
+    grown = (std[1] ** 2 - std[0] ** 2) / (3.0 * GRAVITY * SENSITIVITY) ** 2
+    # By the square of the sensitivity times the force, less what has been learned since.
+    assert grown.min() > (0.3 if counts else -0.03)
+    assert grown.max() < (1.2 if counts else 0.03)
