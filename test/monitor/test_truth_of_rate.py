@@ -44,6 +44,17 @@ def test_the_rate_is_of_the_instant_that_is_stated():
     assert np.sqrt((error**2).mean()) < 0.004
 
 
+def test_instants_increase_where_a_delay_of_several_samples_is_found():
+    """The rate then belongs to an instant before the one of the last sample, for some samples."""
+    output, stamp = late_unit(0.025, seconds=15.0)
+    steps = np.diff(output.instant)
+    assert steps.min() == 1
+    assert steps.max() < 20 * MILLISECOND
+    back = (stamp - output.instant) / MILLISECOND
+    assert (back[:100] == 0.0).all()
+    assert back[-1] == pytest.approx(25.0, abs=2.0)
+
+
 def test_a_delay_that_is_not_taken_off_is_in_the_covariance_of_a_turn():
     """Each unit may be the one in time: the rate is of any instant between theirs."""
     delay = 0.0016
