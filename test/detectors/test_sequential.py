@@ -399,6 +399,22 @@ def test_the_covariance_is_true_while_values_are_missing(together):
         assert chi.max() < 37.0
 
 
+@pytest.mark.parametrize("size", [-0.03, 0.03])
+def test_the_mean_of_a_channel_is_that_of_the_samples_it_has_given(size):
+    """In a turn of 1 rad/s one unit loses one of 20 samples, and a channel of another one is off."""
+    seconds = np.arange(0.0, 25.0, 1.0 / RATE)
+    turn = np.clip(seconds - 3.0, 0.0, 1.0)[:, None] * np.array([1.0, 0.8, -0.9])
+    pipeline = Pipeline.from_config(parallel(3, detector__name="sequential"))
+    z = np.tile(turn, 3) + SIGMA * white(5, len(seconds), 9)
+    z[seconds >= 20.0, 7] += size
+    z[::20, 3:6] = np.nan
+    output = pipeline.process(stamped(seconds, z))
+    (event,) = [one for one in output.events if one.after == ChannelState.FAULTY]
+    assert pipeline.channel_names[event.channel] == "imu_3.y"
+    assert event.error == pytest.approx(size, rel=0.1)
+    assert 20.1 < 1e-9 * (event.stamp - START) < 20.5
+
+
 @pytest.mark.parametrize("hertz", [6.3, 9.7])
 def test_a_slow_motion_under_loud_noise_is_no_rest(hertz):
     """A unit that oscillates by 0.4 rad/s hides how the body turns; no bias is learned of it."""
