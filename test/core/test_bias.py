@@ -82,6 +82,20 @@ def test_a_channel_with_few_values_learns_no_bias(every, known):
     assert bias[4] == pytest.approx(0.01 if known else 0.0, abs=0.001)
 
 
+def test_the_bias_of_a_channel_taken_out_at_the_start_is_as_uncertain_as_before():
+    """An operator may take it into use again, and nothing was averaged meanwhile."""
+    turn_on_std = 0.01
+    settings = config(bias__turn_on_std=turn_on_std, excluded_channels=["g5"])
+    pipeline = Pipeline(settings)
+    z = noise(9)
+    pipeline.process(Block(np.arange(len(z)) * round(1e9 / RATE), z))
+    assert pipeline.status().bias_state == "learned"
+    std = pipeline.core["sample"]["bias_std"][0, :6]
+    assert std[4] == turn_on_std
+    averaged = NOISE / np.sqrt(EFFICIENCY * LENGTH)
+    assert np.delete(std, 4) == pytest.approx(averaged, rel=0.05)
+
+
 @pytest.mark.parametrize(("rate", "axis"), [(0.02, 0), (0.05, 1), (0.09, 2), (0.02, 2)])
 def test_a_slow_turn_is_no_bias(rate, axis):
     found, words, output = learned(turned(noise(5), rate, axis))
