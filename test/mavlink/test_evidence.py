@@ -1443,6 +1443,17 @@ def test_an_error_has_a_size_on_a_slow_link_too() -> None:
     assert size == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.parametrize("unit", [0, 1, 2])
+@pytest.mark.parametrize("error", [-0.5, 0.5])
+def test_an_error_has_the_sign_of_the_imu_that_is_off(unit: int, error: float) -> None:
+    watched = watch()
+    watched.gyros[unit] = biased(error)
+    watched.run(1.0)
+    axis, size = watched.evidence.error(unit, watched.now) or ("", 0.0)
+    assert axis == "x"
+    assert size == pytest.approx(error, abs=0.02)
+
+
 @pytest.mark.parametrize(("apart", "compared"), [(7, True), (9, False)])
 def test_samples_form_a_pair_within_four_tenths_of_an_interval(
     apart: int, compared: bool
