@@ -260,6 +260,27 @@ def test_channels_that_contradict_the_rate_are_in_its_covariance(disturb, usual)
         assert np.nanmedian(np.sqrt(output.covariance[:, 2, 2])) < usual
 
 
+def test_while_two_units_are_in_doubt_as_wholes_either_may_be_the_right_one():
+    """From 20 s on one of two shows a turn a fifth larger: the rate is off by a tenth of it.
+
+    The square of that error counts three times in the covariance: for the channels, for the
+    units, and for the hypotheses on what is wrong.
+    """
+    pipeline = Pipeline(parallel(2, detector__name="sequential"))
+    time = np.arange(2300) / RATE
+    turn = np.clip(time - 3.0, 0.0, 1.0)[:, None] * np.array([0.5, 0.4, -0.6])
+    z = np.tile(turn, 2)
+    z[2000:, 3:] *= 1.2
+    z += np.random.default_rng(5).normal(0.0, SIGMA, z.shape)
+    output = pipeline.process(Block(START + np.arange(2300) * 10 * MILLISECOND, z))
+    last = slice(2050, None)
+    assert (output.state[last] == ChannelState.AMBIGUOUS).all()
+    ratio = (
+        np.diagonal(output.covariance[last], axis1=1, axis2=2) / (0.1 * turn[-1]) ** 2
+    )
+    assert ratio.mean(axis=0) == pytest.approx(3.0, abs=0.4)
+
+
 @pytest.mark.parametrize("offset", range(4))
 def test_a_turn_that_changes_in_a_hole_leaves_the_covariance_as_it_was(offset):
     """From 2 to 8 rad/s about z in 0.6 s; the hole begins at each place of a block of four samples."""
