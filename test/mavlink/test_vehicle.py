@@ -499,6 +499,33 @@ def test_a_message_of_another_system_hides_no_answer_of_the_autopilot() -> None:
     assert [*talk.vehicle.parameters] == [("INS_USE", 1.0)]
 
 
+def test_messages_that_were_overtaken_are_counted_once_and_nine_in_a_row_begin_anew() -> (
+    None
+):
+    autopilot = Autopilot("ardupilot")
+    talk = Conversation(autopilot).run(3.0)
+    talk.cut = True
+    talk.run(0.1)
+    first, lost = talk.vehicle._sequence, talk.vehicle.counts["lost"]
+
+    def send(step: int) -> None:
+        autopilot.mav.seq = (first + step) & 255
+        answer = autopilot.mav.param_value_encode(b"INS_USE", float(step), 9, 1, 0)
+        talk.inject(bytes(answer.pack(autopilot.mav)))
+
+    for k in range(100):
+        send(2 * k + 2)
+        send(2 * k + 1)
+    send(201)
+    assert talk.vehicle.counts["lost"] == lost + 100
+    talk.vehicle.parameters.clear()
+    for step in range(100, 112):
+        send(step)
+    # Those before may be late, so they may be of before an order.
+    assert [value for _, value in talk.vehicle.parameters] == [109.0, 110.0, 111.0]
+    assert talk.vehicle.counts["lost"] == lost + 100
+
+
 def test_what_has_no_checksum_that_can_be_known_is_no_sign_of_life() -> None:
     talk = Conversation(Autopilot("px4")).run(3.0)
     talk.cut = True
