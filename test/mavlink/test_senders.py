@@ -145,6 +145,25 @@ def test_two_counts_are_found_whatever_their_rates(
     assert 10.0 <= at < 16.0
 
 
+def test_two_counts_are_found_though_each_four_messages_come_in_reverse_order() -> None:
+    """A number that comes late is not missing."""
+
+    def reversed_by_four(messages: list[Message]) -> list[Message]:
+        fours = [messages[k : k + 4] for k in range(0, len(messages) - 3, 4)]
+        return [
+            (at, *rest)
+            for four in fours
+            for (at, *_), (_, *rest) in zip(four, four[::-1], strict=True)
+        ]
+
+    one = numbered(20.0, 160.0, 0, "a")
+    other = late(numbered(20.0, 161.0, 128, "b"), lambda: 1e-4)
+    assert found(reversed_by_four(one)) is None
+    at = found(reversed_by_four(one), reversed_by_four(other))
+    assert at is not None
+    assert 10.0 <= at < 16.0
+
+
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("rate", [40.0, 160.0, 900.0])
 def test_two_paths_of_one_sender_are_one(rate: float, seed: int) -> None:
