@@ -103,6 +103,20 @@ def test_going_on_from_a_snapshot_is_the_full_replay_to_the_last_bit(detector):
     assert compared >= len(EVERY)
 
 
+def test_nothing_of_a_fault_that_was_not_found_is_left_for_the_next():
+    """Both go on by fewer channels for some samples, for which the method has sums of its own."""
+    pipeline = Pipeline(Config.from_file(FILE, {"detector.name": "cusum"}))
+    (onset,) = onsets_of(pipeline, flown(), (11.78,), 0.16)
+    first, other, again = (
+        judged_with(pipeline, onset, kind.fault(name, onset.at, sign, seed=0))
+        for kind in parse_swept("kind=bias size=0.01")
+        for name, sign in (("g1", 1.0), ("g2", -1.0), ("g1", 1.0))
+    )
+    assert not any(event.declares for event in first.events)
+    assert (first.statistic != other.statistic).mean() > 0.9
+    np.testing.assert_array_equal(first.statistic, again.statistic)
+
+
 @pytest.mark.parametrize(
     ("alone", "among", "words", "named", "found"),
     [
