@@ -1,42 +1,38 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Positions of accelerometers: simulated vehicles with known arms, and a recording that does not turn."""
+"""Which positions of accelerometers are written, and how uncertain they are said to be."""
 
 import numpy as np
 import pytest
-from vehicles import vehicle, with_forces
+from monitor.streams import parallel
 
-from fdi_ros.inspection.findings import Role, lines_of
-from fdi_ros.setup.calibrate import calibrate
-from fdi_ros.setup.report import calibration_findings
+from fdi_ros.setup.positions import Position, position_settings
 
-pytestmark = pytest.mark.usefixtures("compiled")
+VALUE = np.array([0.10, -0.05, 0.02])
 
 
-@pytest.mark.parametrize("kind", ["rest and turns", "flight with rest"])
-def test_positions_are_within_their_errors(kind):
-    one = vehicle(1, kind)
-    arms = np.array([[0.0, 0.0, 0.0], [0.1, -0.05, 0.02], [0.0, 0.0, -0.03]])
-    result = calibrate(with_forces(one, arms), one.config)
-    for position in result.positions:
-        assert (abs(position.value - arms[position.unit]) < 3 * position.error).all()
-        assert position.measured.all()
-        assert position.error.max() < 0.003
-    config = one.config.replaced(result.settings)
-    written = np.reshape(config.accelerometers.positions, (3, 3))
-    np.testing.assert_allclose(written, arms, atol=0.005)
-    std = config.accelerometers.position_std
-    assert std[0] == 0.0
-    assert 1e-5 < min(std[1:]) <= max(std[1:]) < 0.003
+@pytest.mark.parametrize(
+    ("error", "place", "std"),
+    [
+        ([0.002, 0.009, 0.004], [0.10, -0.05, 0.02], 0.009),
+        # Axes that are not measured stay as configured, and the worst one counts.
+        ([0.002, 0.011, 0.004], [0.10, 0.01, 0.02], 0.3),
+        ([0.4, 0.4, 0.004], [0.01, 0.01, 0.02], 0.3),
+    ],
+)
+def test_a_position_is_as_uncertain_as_its_worst_axis(error, place, std):
+    config = parallel(
+        2,
+        accelerometers__positions=[0.0] * 3 + [0.01] * 3,
+        accelerometers__position_std=[0.0, 0.3],
+    )
+    found = Position(1, "imu_2", VALUE, np.array(error))
+    written = position_settings((found,), config)
+    assert written["accelerometers.positions"] == [0.0] * 3 + place
+    assert written["accelerometers.position_std"] == [0.0, std]
 
 
-@pytest.mark.parametrize("noise", [0.005, 0.05])
-def test_without_turns_no_position_is_measured(noise):
-    one = vehicle(0, "rest and turns")
-    block = with_forces(one, np.full((3, 3), 0.1) * [[0], [1], [-1]], noise)[:1450]
-    result = calibrate(block, one.config)
-    assert not any(position.measured.any() for position in result.positions)
-    assert "accelerometers.positions" not in result.settings
-    unknown = lines_of(calibration_findings(result, "base_link"), Role.UNKNOWN)
-    assert sum("x not measured, y not measured" in line for line in unknown) == 2
+def test_a_position_of_which_no_axis_is_measured_is_not_written():
+    found = Position(1, "imu_2", VALUE, np.full(3, 0.011))
+    assert position_settings((found,), parallel(2)) == {}
