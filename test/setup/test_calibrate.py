@@ -259,6 +259,16 @@ def test_the_monitor_waits_for_units_that_are_late():
     )
 
 
+def test_no_second_beside_motion_is_rest_and_all_before_is():
+    """Noise may hide how a motion begins."""
+    one, result = made(0, "rest and turns")
+    found = result.estimate
+    begins = one.motion.time[1] - np.abs(one.late).max()
+    ends = found.blocks.time + 0.5
+    assert found.rest[ends < begins - 1.1].all()
+    assert not found.rest[(ends > begins - 0.1) & (ends < begins + 3.0)].any()
+
+
 def test_a_noisy_channel_hides_no_rest():
     one, z = (
         made(0, "flight with rest")[0],
