@@ -340,10 +340,6 @@ def _check_topics(config: Config) -> None:
         raise ConfigError(
             f"imus.delays is given, but input is {config.input!r}: an array has one stamp for all"
         )
-    if config.imus.topics and not config.has_units:
-        raise ConfigError(
-            f"imus.topics is given, but input is {config.input!r}: set `input: imus` to read IMU topics"
-        )
     for topic in config.topics:
         if not is_topic(topic):
             raise ConfigError(

@@ -17,8 +17,8 @@ from fdi_ros.model.samples import Array
 
 #: segments of a window, in a row: long enough for a slow swing, short for a drift
 WINDOW_SEGMENTS = 8
-#: usual step between segments in a row, over which there is a gap
-LONGEST_STEP = 1.5
+#: steps between segments, over the usual one, from which on there is a gap
+GAP_STEPS = 1.5
 #: specific force over the usual one, below which its direction is not known
 LEAST_FORCE = 0.1
 
@@ -91,7 +91,7 @@ def _runs(rates: NoiseSegments, forces: NoiseSegments) -> list[list[_Pair]]:
         nearest = int(np.abs(begin - one.first).argmin())
         if abs(begin[nearest] - one.first) > BLOCK_TIME * 1e9:
             continue
-        if runs[-1] and one.first - runs[-1][-1].first > LONGEST_STEP * usual:
+        if runs[-1] and one.first - runs[-1][-1].first > GAP_STEPS * usual:
             runs.append([])
         runs[-1].append(_Pair(one.first, one.means, felt[nearest].means))
     return runs

@@ -6,8 +6,6 @@
 import pytest
 from bag.recordings import ARRAY, IMU
 
-from fdi_ros.config.config import Config
-from fdi_ros.errors import ConfigError
 from fdi_ros.monitor.inputs import is_of_a_monitor, other_input
 
 
@@ -49,13 +47,3 @@ def test_an_array_is_another_input_only_where_there_is_no_imu():
     assert other_input(IMU, [("/gyros", ARRAY), *imus(1)]) == ""
     assert is_of_a_monitor("/drone/fdi_node/integrity")
     assert not is_of_a_monitor("/imu_1")
-
-
-def test_imu_topics_without_their_input_are_refused():
-    topics = {"imus.topics": ["/imu_1", "/imu_2"]}
-    with pytest.raises(
-        ConfigError,
-        match=r"^imus.topics is given, but input is 'channels': set `input: imus` to read IMU topics$",
-    ):
-        Config.from_parameters(topics)
-    assert Config.from_parameters({**topics, "input": "imus"}).has_units
