@@ -146,7 +146,7 @@ class Aligner:
 
 @record
 class Sample:
-    """One sample of all units, three channels each."""
+    """One sample of all channels."""
 
     stamp: Whole  # ns
     shift: Whole  # stamp less the message's, ns
