@@ -5,7 +5,8 @@
 
 Records are walked from the start. Footer, summary and indexes are not trusted: a
 recording that a crash cut off has none. The first walk reads only the headers of chunks
-and finds their order in time; without statistics, or if times step back, it reads all. The second one reads the chunks in that order. Layout of
+and finds their order in time; without statistics, or if times step back, it reads all.
+The second one reads the chunks in that order. Layout of
 the records: https://mcap.dev/spec.
 """
 

@@ -382,7 +382,7 @@ def follow_moves(params: Constants, state: State) -> None:
     believe_noise(params, kf, inference)
     best = find_returned(params, kf, case.references, inference, least)
     if best >= 0:
-        return_biases(params, kf, case.references, best)
+        return_biases(params, kf, case.references, best, inference.mask)
         forget_evidence(params, state)
         update_weights(params, kf)
 

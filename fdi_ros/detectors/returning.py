@@ -27,6 +27,9 @@ from fdi_ros.estimator.estimator import SNAPSHOTS, TIERS, Constants, Estimator
 
 REFERENCES = 4
 """Number of the last moves of all biases whose end is looked for."""
+LONGEST_MOVE = 300.0
+"""Largest age of biases that are taken again, s. Their covariance is that of the estimator up
+to this age; at 1200 s it is 0.6 of it."""
 
 
 @record
@@ -176,7 +179,8 @@ def find_returned(
         suppose_returned(params, kf, inference, reference, -1.0)
         reference.evidence = max(reference.evidence, 0.0) + gained
         fits = rest <= FIT + FIT_PER_CHECK * max(free, 0)
-        if fits and reference.evidence > least:
+        is_recent = kf.seconds - reference.seconds < LONGEST_MOVE
+        if fits and is_recent and reference.evidence > least:
             best = k
             least = reference.evidence
     return best
@@ -184,36 +188,49 @@ def find_returned(
 
 @compiled
 def return_biases(
-    params: Constants, kf: Estimator, references: References, k: int
+    params: Constants, kf: Estimator, references: References, k: int, mask: int
 ) -> None:
-    """Give the present states, and all snapshots since, the biases of a reference."""
+    """Give the present states, and all snapshots since, the biases of a reference.
+
+    mask: channels that showed the return. The others, which were silent, keep their own.
+    """
     reference = references.kept[k]
     for other in range(REFERENCES):
         references.kept[other].evidence = 0.0
-    replace_biases(params, kf.states, reference, kf.seconds - reference.seconds)
+    replace_biases(params, kf.states, reference, kf.seconds - reference.seconds, mask)
     for k in range(TIERS * SNAPSHOTS):
         snapshot = kf.snapshots[k]
         passed = snapshot.seconds - reference.seconds
         if passed > 0.0:
-            replace_biases(params, snapshot.states, reference, passed)
+            replace_biases(params, snapshot.states, reference, passed, mask)
 
 
 @compiled
 def replace_biases(
-    params: Constants, states: ErrorStates, reference: Reference, seconds: float
+    params: Constants,
+    states: ErrorStates,
+    reference: Reference,
+    seconds: float,
+    mask: int,
 ) -> None:
-    """Replace the biases and their rates by those of a reference so long before."""
+    """Replace the biases and rates of some channels by those of a reference so long before."""
     n = params.sensors.n
     layout = params.layout
     rates = first_rate(layout)
     for i in range(n):
+        if not mask >> i & 1:
+            continue
         for r in (i, rates + i):
             for c in range(layout.count):
                 states.p[r, c] = states.p[c, r] = 0.0
     for i in range(n):
+        if not mask >> i & 1:
+            continue
         states.x[i] = reference.bias[i] + seconds * reference.rate[i]
         states.x[rates + i] = reference.rate[i]
         for j in range(n):
+            if not mask >> j & 1:
+                continue
             mixed = reference.mixed[i, j] + seconds * reference.rate_covariance[i, j]
             states.p[i, j] = covariance_since(params, reference, seconds, i, j)
             states.p[i, rates + j] = states.p[rates + j, i] = mixed

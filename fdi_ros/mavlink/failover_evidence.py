@@ -860,12 +860,22 @@ class Evidence:
         another partner then proves nothing: that one may have failed alike.
         """
         return any(
-            self._pairs[unit, k].full[axis] >= self._min_size
+            self._pairs[unit, k].full[axis] >= self._hidden(wrong, unit, k, axis)
             for k in partners
             if ChannelState.FAULTY not in self._tracks[k].states
             for axis, wrong in self._tracks[unit].wrong.items()
             if wrong.share <= MOST_RANGE_SHARE
         )
+
+    def _hidden(self, wrong: Wrong, unit: int, other: int, axis: int) -> float:
+        """Return the least difference, rad/s, that half of the former error of scale makes now.
+
+        A partner with a small error of scale of its own differs by less.
+        """
+        rates = (self.raw.motion(k).mean[axis] for k in (unit, other))
+        # The share was measured without the part that scales explain.
+        error = (wrong.share + SCALE) * abs(nearest_zero(tuple(rates)))
+        return max(self._min_size, error / 2.0)
 
     def _voters(self, unit: int, units: Sequence[int]) -> list[int]:
         """Return the two other IMUs, if they may outvote one, or none.

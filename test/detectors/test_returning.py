@@ -160,7 +160,7 @@ def test_the_states_after_the_move_are_those_before_it():
     earlier["seconds"] = -1.0
     others = slice(N, flight.rates)
     p = flight.states["p"][others, others].copy()
-    return_biases(flight.params, flight.kf, flight.references, 0)
+    return_biases(flight.params, flight.kf, flight.references, 0, (1 << N) - 1)
     drift = flight.before["x"][flight.rates : flight.rates + N]
     biases = flight.before["x"][:N]
     np.testing.assert_allclose(flight.states["x"][:N], biases + PASSED * drift)
@@ -176,3 +176,27 @@ def test_the_states_after_the_move_are_those_before_it():
         np.linalg.eigvalsh(whole / np.sqrt(np.outer(*[np.diag(whole)] * 2))).min()
         > -1e-9
     )
+
+
+def test_a_channel_that_was_silent_keeps_its_bias_and_variance() -> None:
+    """It may come back with another bias than it had before the move."""
+    flight = Flight(0)
+    silent = 5
+    p, x, n = flight.states["p"], flight.states["x"], flight.rates + N
+    kept = x[silent], p[silent, silent]
+    mask = (1 << N) - 1 - (1 << silent)
+    return_biases(flight.params, flight.kf, flight.references, 0, mask)
+    assert (x[silent], p[silent, silent]) == kept
+    assert p[0, silent] == p[silent, 0] == 0.0
+    assert np.linalg.eigvalsh(p[:n, :n]).min() > -1e-12
+    assert p[0, 0] < kept[1]
+
+
+@pytest.mark.parametrize(("age", "is_taken"), [(250.0, True), (350.0, False)])
+def test_biases_from_long_ago_are_not_taken_again(age: float, is_taken: bool) -> None:
+    flight = Flight(0)
+    flight.references["kept"][0]["seconds"] = flight.kf["seconds"] - age
+    drift = age * flight.before["x"][flight.rates : flight.rates + N]
+    flight.show(flight.before["x"][:N] + drift)
+    found = [flight.find() for _ in range(20)]
+    assert (0 in found) == is_taken

@@ -906,6 +906,25 @@ def test_an_error_of_scale_may_hide_in_a_turn_about_another_axis() -> None:
     assert not watched.run(2.0).step()[0].waits
 
 
+@pytest.mark.parametrize(("share", "third"), [(1.1, 1.045), (1.08, 1.03)])
+def test_a_small_error_of_scale_of_the_third_keeps_no_healed_one_out(
+    share: float, third: float
+) -> None:
+    watched = watch()
+    watched.rate = lambda t: np.array([0.2, 1.6 + 0.2 * math.sin(t), 0.0])
+    watched.gyros[0] = scaled(share)
+    watched.gyros[2] = scaled(third)
+    watched.states[1] = FAULTY
+    watched.run(3.0).out = [0]
+    watched.run(1.0).gyros[0] = sound
+    watched.states = [OK] * 9
+    watched.rate = lambda t: np.array([0.2, 1.6 * math.sin(0.5 * t), 0.0])
+    watched.run(12.0)
+    imu = watched.step()[0]
+    assert imu.agreed is not None
+    assert not imu.waits
+
+
 def test_agreement_with_an_axis_that_the_monitor_doubts_shows_nothing() -> None:
     """While the third one differs, in whatever way."""
     watched = without_scale()
