@@ -733,10 +733,10 @@ def choose(inference: Inference, n: int, confidence: float) -> None:
 
 
 @compiled
-def explain(params: Constants, inference: Inference) -> None:
-    """Find the smallest set of hypotheses that holds the truth with the wanted confidence."""
+def fill_total(params: Constants, inference: Inference) -> float:
+    """Calculate u = A y and y' A y / 2 of the mean; return log determinants as `fill_joint_parity` does."""
     n = params.sensors.n
-    fill_joint_parity(
+    log_det = fill_joint_parity(
         inference.parity,
         params.sensors,
         inference.mask,
@@ -749,6 +749,14 @@ def explain(params: Constants, inference: Inference) -> None:
         inference.u[i] = dot_in(information, inference.y, n, inference.mask)
         if inference.mask >> i & 1:
             inference.total += 0.5 * inference.u[i] * inference.y[i]
+    return log_det
+
+
+@compiled
+def explain(params: Constants, inference: Inference) -> None:
+    """Find the smallest set of hypotheses that holds the truth with the wanted confidence."""
+    n = params.sensors.n
+    fill_total(params, inference)
     inference.count = 0
     add_channels(inference, n)
     inference.small = inference.count

@@ -13,12 +13,11 @@ from __future__ import annotations
 from typing import Annotated
 
 from fdi_ros.compiling.compiled import Channels, Real, Square, Whole, compiled, record
-from fdi_ros.core.algebra import dot_in
-from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity
 from fdi_ros.detectors.naming import (
     FIT,
     FIT_PER_CHECK,
     Inference,
+    fill_total,
     noise_of_mean,
     redundancy,
 )
@@ -113,20 +112,7 @@ def believe_noise(params: Constants, kf: Estimator, inference: Inference) -> Non
 @compiled
 def log_evidence(params: Constants, inference: Inference) -> float:
     """Return the log likelihood of the mean, whatever the rate."""
-    n = params.sensors.n
-    log_det = fill_joint_parity(
-        inference.parity,
-        params.sensors,
-        inference.mask,
-        inference.covariance,
-        UNKNOWN_RATE,
-    )
-    inference.total = 0.0
-    for i in range(n):
-        if inference.mask >> i & 1:
-            information = inference.parity.information[i]
-            total = dot_in(information, inference.y, n, inference.mask)
-            inference.total += 0.5 * total * inference.y[i]
+    log_det = fill_total(params, inference)
     return -inference.total - 0.5 * log_det
 
 
