@@ -890,22 +890,6 @@ def test_one_that_has_healed_shows_that_beside_one_that_never_sent() -> None:
     assert not imus[0].waits
 
 
-def test_an_error_of_scale_may_hide_in_a_turn_about_another_axis() -> None:
-    """The two read twice the rate about y. That is less than what scales explain about x."""
-
-    def turning_about_both(t: float) -> np.ndarray:
-        return np.array([2.2, 0.12, 0.0]) * (1.0 + 0.1 * math.sin(2.0 * t))
-
-    watched = without_scale(2.0)
-    watched.gyros[1] = scaled(2.05)
-    watched.states = [OK] * 9
-    watched.run(1.0).rate = turning_about_both
-    assert {watched.step()[0].waits for _ in range(400)} == {"y"}
-    watched.gyros[:2] = [sound, sound]
-    watched.run(1.0)
-    assert not watched.run(2.0).step()[0].waits
-
-
 @pytest.mark.parametrize(("share", "third"), [(1.1, 1.045), (1.08, 1.03)])
 def test_a_small_error_of_scale_of_the_third_keeps_no_healed_one_out(
     share: float, third: float
