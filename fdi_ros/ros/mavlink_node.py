@@ -240,6 +240,7 @@ class AutopilotNode(CheckedNode):
             self._turn()
 
     def _give_turn(self, executor: Any) -> None:
+        # A flood of callbacks must not keep the node from the link.
         for _ in range(32):
             self._called = False
             executor.spin_once(timeout_sec=0.0)
