@@ -7,7 +7,8 @@ A record is 8 bytes of time (us since 1970, big endian), when the message came o
 link, and a message of MAVLink 1 or 2. A record counts only if another one follows
 directly. Messages in use also need a valid checksum. One autopilot is read, by the
 description that also serves a live link (`fdi_ros.mavlink.protocol`). Stamps are the
-autopilot's own. UTC comes from the message with the least delay.
+autopilot's own. UTC comes from the message with the least delay. Texts, modes and
+throttle have no stamp: their stamps come from the samples around them.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ import math
 import struct
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdi_ros.bag.flight_log import (
     ImuSamples,
@@ -66,6 +68,9 @@ _TIME = 8
 _LEAST = _TIME + 8
 #: messages beside the rates that are kept: the first ones
 _MOST_BESIDE = 100_000
+#: samples around a message that show the present difference of the two clocks. The
+#: median of nine is right with four damaged times
+_AROUND = 9
 #: largest time, us
 _LATEST = 1 << 53
 _ROW = struct.Struct("=3q7d")
@@ -80,6 +85,16 @@ _SAMPLE_COLUMNS = np.dtype(
     ]
 )
 """Of each sample, with the time at which its message came, us since 1970."""
+
+
+class _Beside(NamedTuple):
+    """A message beside the samples."""
+
+    #: first byte of its record in the file
+    begin: int
+    #: time at which it came, us since 1970
+    came: int
+    message: Any
 
 
 _FOUND = (
@@ -144,13 +159,13 @@ class Tlog(LibraryLog):
             return {}
         self.system, autopilot = chosen
         found: defaultdict[Source, bytearray] = defaultdict(bytearray)
-        beside: list[tuple[int, Any]] = []
+        beside: list[_Beside] = []
         for at, end, message in self._messages(data, (*_IMUS, *_OTHER_MESSAGES)):
             if message.get_srcSystem() != self.system:
                 continue
             came = int.from_bytes(data[at : at + _TIME], "big")
             if (number := message.get_msgId()) not in IMU_MESSAGES:
-                beside.append((came, message))
+                beside.append(_Beside(at, came, message))
                 del beside[_MOST_BESIDE:]
             elif understood(IMU_MESSAGES[number].kind, autopilot):
                 self._take_sample(found, message, data[at:end], came, end)
@@ -167,8 +182,9 @@ class Tlog(LibraryLog):
         for source, table in tables.items():
             table.flags.writeable = False  # several openings may share it
             self.add_temperature(source.instance, table["stamp"], table["temperature"])
-        for came, message in beside:
-            self._take_beside(message, came, autopilot)
+        stamps = _stamps_of(beside, list(tables.values()))
+        for one, stamp in zip(beside, stamps, strict=True):
+            self._take_beside(one.message, stamp, autopilot)
         return {
             source: {name: table[name] for name in _SAMPLE_COLUMNS.names or ()}
             for source, table in tables.items()
@@ -193,15 +209,14 @@ class Tlog(LibraryLog):
             values = *reading.rate, *reading.acceleration, _degrees(message)
             found[Source(kind, reading.unit)] += _ROW.pack(*times, end, *values)
 
-    def _take_beside(self, message: Any, came: int, autopilot: int) -> None:
-        """Take a text, a mode, the throttle or an id. ``came``: us since 1970."""
+    def _take_beside(self, message: Any, stamp: int, autopilot: int) -> None:
+        """Take a text, a mode, the throttle or an id. ``stamp``: us, as of the samples."""
         name = message.get_type()
         if name == "AUTOPILOT_VERSION":
             serial = bytes(message.uid2).hex()
             self.hardware_id = serial.strip("0") and serial
         if self.start_utc is None:
             return
-        stamp = came - self.start_utc
         if name == "STATUSTEXT":
             self.add_text(stamp, "STATUSTEXT", str(message.text))
         elif name == "HEARTBEAT" and message.autopilot == autopilot:
@@ -302,6 +317,26 @@ def record_end(data: bytes, at: int) -> int:
     if end + _TIME >= len(data):
         return end
     return end if data[end] == 0 and data[end + _TIME] in _MARKS else 0
+
+
+def _stamps_of(beside: Sequence[_Beside], tables: Sequence[NDArray[Any]]) -> list[int]:
+    """Return the stamps of messages, us, by the samples around each in the file.
+
+    The times of coming alone do not show them: the clocks of autopilot and ground station may
+    drift apart. A simulation on a busy computer loses seconds.
+    """
+    samples = np.concatenate([np.empty(0, _SAMPLE_COLUMNS), *tables])
+    if not len(samples):
+        return [0] * len(beside)
+    samples = samples[np.argsort(samples["end"], kind="stable")]
+    place = np.searchsorted(samples["end"], [one.begin for one in beside], "right")
+    around = place[:, None] + np.arange(_AROUND) - _AROUND // 2
+    around = np.clip(around, 0, len(samples) - 1)
+    starts = samples["came"][around] - samples["stamp"][around]
+    start = np.sort(starts, axis=1)[:, _AROUND // 2]
+    came = np.array([min(one.came, _LATEST) for one in beside], dtype=np.int64)
+    stamps: list[int] = (came - start).tolist()
+    return stamps
 
 
 def _start_utc_by(starts: Sequence[Int]) -> int | None:

@@ -13,7 +13,7 @@ from bag import test_logs as logs
 from bag.logs import SCALED, UTC, telemetry
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mavlink.autopilots import Autopilot
+from mavlink.autopilots import NS, Autopilot
 from pymavlink import mavutil
 
 from fdi_ros.bag.reader import Recording
@@ -99,6 +99,62 @@ def test_values_and_times_are_those_that_pymavlink_reads(tmp_path, stack, versio
     # UTC is that of the least delayed message of all.
     assert -1e-6 <= min(late) < 1e-6
     assert max(late) < 0.012
+
+
+SPOKE = 4.0
+"""Time of a text, a mode and a throttle, s of the autopilot."""
+
+
+def spoken(pace, damaged=()):
+    """Return a log in which the autopilot's time passes at a pace that changes at half of `SPOKE`.
+
+    The ground station notes its own time. Of some samples near the text, by number, that time is
+    damaged.
+    """
+    autopilot = Autopilot("ardupilot", rates=SCALED)
+    out, number = b"", 0
+    for now in range(0, 6 * NS, 1_000_000):
+        slow = max(now - round(SPOKE / 2 * NS), 0)
+        came = (UTC + now + round(slow * (1 / pace - 1))) // 1000 + 5000
+        for data in autopilot.step(now):
+            if data[7] | data[8] << 8 in SCALED and now >= SPOKE * NS:
+                number += 1
+            wrong = 30_000_000 * (number in damaged)
+            out += struct.pack(">Q", came + wrong) + data
+        if now == SPOKE * NS:
+            mav = autopilot.mav
+            for one in (
+                mav.statustext_encode(2, b"Crash: Disarming"),
+                mav.heartbeat_encode(2, 3, 1, 9, 4),
+                mav.vfr_hud_encode(0, 0, 0, 70, 0, 0),
+            ):
+                out += struct.pack(">Q", came) + bytes(one.pack(mav))
+    return out
+
+
+@pytest.mark.parametrize("damaged", [(), (1, 2, 3, 4)])
+@pytest.mark.parametrize("pace", [0.6, 1.0, 4.0])
+def test_a_text_is_at_the_time_of_the_samples_around_it(tmp_path, pace, damaged):
+    """A simulation is slower or faster than the clock of the ground station."""
+    path = written(tmp_path / "slow.tlog", spoken(pace, damaged))
+    first = min(messages(path, "/imu_1")) / 1e9
+    with Recording(path) as recording:
+        (text,) = recording.texts
+        modes = {one.name: one.stamp for one in recording.context.modes}
+        throttle = recording.context.throttle
+    assert text.text == "Crash: Disarming"
+    for stamp in (text.stamp, modes["LAND"], throttle.stamp[-1]):
+        assert abs(stamp / 1e9 - first - SPOKE) < 0.05
+
+
+def test_the_bundled_copter_hits_the_ground_when_its_gyros_jump(root):
+    """Its simulation lost more than a second."""
+    path = root / "bags" / "copter_crash.tlog"
+    stamp, rate, _ = logs.messages(path)[0]["/imu_1"]
+    hit = stamp[np.argmax(np.abs(rate).max(axis=1) > 10.0)]
+    with Recording(path) as recording:
+        (text,) = [one for one in recording.texts if "Hit ground" in one.text]
+    assert abs(text.stamp - hit) < 0.1 * NS
 
 
 def test_of_two_vehicles_the_first_is_read(tmp_path):
