@@ -20,14 +20,14 @@ ROOT = Path(__file__).parents[1]
 #: Files whose tests mostly wait for processes that they start, the longest first.
 WAITING = (
     "test_own_node.py",
-    "test_node.py",
     "test_bench.py",
     "test_mavlink.py",
-    "test_package.py",
-    "test_montecarlo.py",
+    "test_node.py",
     "test_readme.py",
-    "test_storm.py",
+    "test_montecarlo.py",
     "test_watch.py",
+    "test_package.py",
+    "test_storm.py",
     "test_accelerometer_array.py",
 )
 #: processes that run the tests side by side
@@ -89,6 +89,11 @@ def pytest_unconfigure():
     shutil.rmtree(os.environ["ROS_LOG_DIR"], ignore_errors=True)
 
 
+def pytest_collectstart():
+    """Collect no garbage while tests are collected: all that is made then stays until the end."""
+    gc.disable()
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report(collector):
     """Let each process collect the tests from another folder on.
@@ -147,6 +152,7 @@ def pytest_collection_finish():
     """Let the garbage collector pass over modules and tests, which stay until the end."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture
