@@ -9,7 +9,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-import pandas
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -90,6 +89,8 @@ def test_without_settings_units_that_are_turned_are_refused(flight):
 
 
 def test_the_bundled_crash_needs_no_settings(root):
+    import pandas
+
     result = fdi_ros.replay(root / "bags" / "copter_crash.tlog")
     [fault] = result.story.declared
     assert fault.channels == ("imu_1.x",)
@@ -134,6 +135,8 @@ def test_things_say_what_they_are(flight, config):
 
 
 def test_an_output_becomes_a_table(flight, config, monkeypatch):
+    import pandas
+
     output = fdi_ros.Pipeline(config).process(read_block(flight, config, 0.0, 5.0))
     table = output.to_pandas()
     assert table.shape == (500, 3 + 3 + 3 + 3 + 2 * 6)

@@ -83,3 +83,9 @@ def alarms(detector, noise, rows, seed):
             detector.detect(z, None if noise.constant else acceleration).alarm.sum()
         )
     return total
+
+
+def log_density(x, covariance):
+    """Logarithm of the density of a normal distribution about zero at x (n,)."""
+    _, log_det = np.linalg.slogdet(2.0 * np.pi * covariance)
+    return -0.5 * float(log_det + x @ np.linalg.solve(covariance, x))

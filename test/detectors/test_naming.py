@@ -8,10 +8,9 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from detectors.detector_trials import random_axes
+from detectors.detector_trials import log_density, random_axes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import multivariate_normal
 
 from fdi_ros import Geometry, NoiseModel
 from fdi_ros.compiling.compiled import allocate
@@ -92,7 +91,7 @@ def evidence(mean, errors):
     """Logarithm of the likelihood of the parity vector with errors of that covariance (n, n)."""
     parity = mean.geometry.parity
     spread = parity @ (mean.covariance + errors) @ parity.T
-    return float(multivariate_normal.logpdf(parity @ mean.y, cov=spread))
+    return log_density(parity @ mean.y, spread)
 
 
 def amplitudes(mean, directions):
