@@ -179,10 +179,9 @@ def test_a_fault_of_a_unit_is_one_episode_of_gyros_and_accelerometers(
     assert "m/s^2" in summary_text(summary)
 
 
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("in_both", [True, False])
 @pytest.mark.parametrize("hertz", [2.0, 6.0])
-@pytest.mark.parametrize("units", [2, 3])
+@pytest.mark.parametrize(("units", "seed"), [(2, 0), (2, 1), (3, 1)])
 def test_a_loose_unit_is_one_episode_that_names_no_other(
     units, hertz, in_both, seed, tmp_path
 ):
