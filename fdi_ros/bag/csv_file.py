@@ -40,13 +40,7 @@ from fdi_ros.bag.raw import MOST_SHOWN, Damage
 from fdi_ros.errors import BagError
 from fdi_ros.model.quantity import STANDARD_GRAVITY
 from fdi_ros.model.samples import Array, Int
-from fdi_ros.system.files import (
-    CSV_COLUMNS,
-    CSV_LINE_BYTES,
-    EARLIEST,
-    NAME,
-    open_regular,
-)
+from fdi_ros.system.files import RECORDING, TABLE, TIMES, open_regular
 from fdi_ros.system.text import own_numbers, shown
 from fdi_ros.system.yaml_file import read_yaml
 
@@ -204,7 +198,7 @@ class CsvLog(FlightLog):
                         (
                             tick
                             for tick in (1e-9, 1e-6, 1e-3)
-                            if first * tick * 1e9 >= EARLIEST
+                            if first * tick * 1e9 >= TIMES.earliest
                         ),
                         1.0,
                     )
@@ -264,8 +258,8 @@ def find_columns(
         raise BagError(f"{file.name} is UTF-16: save it as UTF-8")
     file.seek(0)
     for _ in range(64):
-        line = file.readline(CSV_LINE_BYTES).decode("utf-8", "replace")
-        if sum(map(line.count, ",;\t")) >= 3 and len(line) < CSV_LINE_BYTES:
+        line = file.readline(TABLE.line_bytes).decode("utf-8", "replace")
+        if sum(map(line.count, ",;\t")) >= 3 and len(line) < TABLE.line_bytes:
             break
     else:
         raise BagError(
@@ -276,14 +270,14 @@ def find_columns(
         name.strip().strip('"')
         for name in line.lstrip("\ufeff# ").strip().split(delimiter)
     ]
-    if len(names) > CSV_COLUMNS:
+    if len(names) > TABLE.columns:
         raise BagError(
-            f"{file.name} has {len(names)} columns, expected at most {CSV_COLUMNS}"
+            f"{file.name} has {len(names)} columns, expected at most {TABLE.columns}"
         )
-    if (longest := max(map(len, names))) > NAME:
+    if (longest := max(map(len, names))) > RECORDING.name_length:
         raise BagError(
             f"{file.name} has a column name of {longest} characters, expected at most"
-            f" {NAME}"
+            f" {RECORDING.name_length}"
         )
     if np.isfinite([_number(names, k) for k in range(len(names))]).all():
         raise BagError(

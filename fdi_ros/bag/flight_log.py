@@ -43,7 +43,7 @@ from fdi_ros.bag.recorder_clock import RecorderClock
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Bytes, Int
-from fdi_ros.system.files import EARLIEST, LATEST_TIME, LOG_SPAN
+from fdi_ros.system.files import TIMES
 from fdi_ros.system.text import figures, percent, shown
 
 IMU = "sensor_msgs/msg/Imu"
@@ -178,7 +178,7 @@ class Track:
         before = np.maximum.accumulate(np.append(first, come[:-1]))
         self.come = max(first, int(come.max()))
         # A jump ahead by years is a second log too: its times became dates, or ceased.
-        behind = (come < before - _MAX_STEP_BACK) | (come - before > LOG_SPAN)
+        behind = (come < before - _MAX_STEP_BACK) | (come - before > TIMES.log_span)
         return int(samples["end"][np.argmax(behind)]) if behind.any() else 0
 
     @property
@@ -259,7 +259,7 @@ class FlightLog(BagFile):
         except BaseException:  # Close the file whatever ends the opening.
             self.close()
             raise
-        dated = EARLIEST // 1000 <= self._starts[0] < NO_HORIZON
+        dated = TIMES.earliest // 1000 <= self._starts[0] < NO_HORIZON
         if self.status:
             self.state(self.status)
         self._shift = (
@@ -466,8 +466,8 @@ class FlightLog(BagFile):
     def _possible(self, samples: ImuSamples) -> ImuSamples:
         """Leave out samples with impossible times, or times far from their neighbours."""
         stamp = samples["stamp"]
-        good = ((stamp >= 0) & (stamp <= LOG_SPAN)) | (
-            (stamp >= EARLIEST // 1000) & (stamp <= LATEST_TIME // 1000)
+        good = ((stamp >= 0) & (stamp <= TIMES.log_span)) | (
+            (stamp >= TIMES.earliest // 1000) & (stamp <= TIMES.latest // 1000)
         )
         if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _MAX_TIME_STEP).any():
             # Most of five neighbours are right, and a gap has neighbours on both sides.
@@ -650,9 +650,9 @@ def possible_start(utc: Int, stamp: Int) -> int | None:
     """
     good = (
         (stamp >= 0)
-        & (stamp <= LOG_SPAN)
-        & (utc >= EARLIEST // 1000)
-        & (utc <= LATEST_TIME // 1000 - LOG_SPAN)
+        & (stamp <= TIMES.log_span)
+        & (utc >= TIMES.earliest // 1000)
+        & (utc <= TIMES.latest // 1000 - TIMES.log_span)
     )
     return int((utc - stamp)[np.argmax(good)]) if good.any() else None
 

@@ -12,9 +12,7 @@ import numpy as np
 
 from fdi_ros.bag.raw import BagFile, Batch, Topic
 from fdi_ros.bag.recorder_clock import LEAST_SET_BACK, RecorderClock
-from fdi_ros.system.files import (
-    PORTION_BYTES,
-)
+from fdi_ros.system.files import RECORDING
 
 #: messages handed on at once, at most
 _BATCH_MESSAGES = 4096
@@ -69,5 +67,5 @@ def _together(messages: Iterator[Message]) -> Iterator[Message]:
     for k, message in enumerate(messages, 1):
         yield message
         held += len(message[2])
-        if k == _BATCH_MESSAGES or held >= PORTION_BYTES:
+        if k == _BATCH_MESSAGES or held >= RECORDING.portion_bytes:
             return

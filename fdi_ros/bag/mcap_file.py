@@ -45,16 +45,7 @@ from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.messages import read_bits
 from fdi_ros.core.sources import source_of_type
 from fdi_ros.model.samples import Bytes, Int
-from fdi_ros.system.files import (
-    CHUNK_BYTES,
-    DESCRIPTION_BYTES,
-    DESCRIPTIONS,
-    MOST_TOPICS,
-    NAME,
-    PORTION_BYTES,
-    RECORD_BYTES,
-    RECORDS,
-)
+from fdi_ros.system.files import MCAP, RECORDING
 
 # As whole numbers, which compiled code compares with bytes.
 FOOTER = int(Opcode.FOOTER)
@@ -80,10 +71,10 @@ def decompress(
     A ``crc`` of 0 is not checked. A chunk known to be cut off gives all that
     decompresses. Returns the bytes and a description of the damage, which may be empty.
     """
-    if max(size, len(data) if not compression else 0) > CHUNK_BYTES:
+    if max(size, len(data) if not compression else 0) > RECORDING.chunk_bytes:
         return (
             b"",
-            f"claims {size} bytes, expected at most {CHUNK_BYTES}, and was left out",
+            f"claims {size} bytes, expected at most {RECORDING.chunk_bytes}, and was left out",
         )
     try:
         if compression == "zstd":
@@ -141,7 +132,7 @@ def walk(
 def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
     """Find messages, schemas and channels in a run of bytes, as `walk` does.
 
-    Schemas and channels beyond the first `DESCRIPTIONS` are skipped: an empty record
+    Schemas and channels beyond the first `MCAP.descriptions` are skipped: an empty record
     takes 9 bytes, and a list of millions of messages would take 40 bytes each. ``found`` (5,
     room) receives per record: opcode, channel and log time (messages only), offset,
     length. Returns the number of records, those beyond the room included, and the end
@@ -160,7 +151,7 @@ def find_records(data: Bytes, outside: bool, found: Int) -> tuple[int, int]:
         head = _MESSAGE_HEAD if opcode == MESSAGE else 0
         described = opcode in (SCHEMA, CHANNEL)
         descriptions += described
-        wanted = described and descriptions <= DESCRIPTIONS
+        wanted = described and descriptions <= MCAP.descriptions
         if wanted or (opcode == MESSAGE and length >= head):
             if count < found.shape[1]:
                 found[0, count] = opcode
@@ -237,7 +228,9 @@ class McapFile(BagFile):
         self._found.sort(key=lambda piece: piece.start_time)
         self.start_time = self._found[0].start_time if self._found else NO_HORIZON
         self.end_time = max((piece.end_time for piece in self._found), default=0)
-        ends = np.cumsum([min(piece.raw_size, CHUNK_BYTES) for piece in self._found])
+        ends = np.cumsum(
+            [min(piece.raw_size, RECORDING.chunk_bytes) for piece in self._found]
+        )
         self._pieces = self._found[: np.searchsorted(ends, most, side="right")]
         """In the order of time, those that unpack to no more than they may."""
         if len(self._pieces) < len(self._found):
@@ -349,7 +342,9 @@ class McapFile(BagFile):
             for k in range(first, len(batch)):
                 message = batch.message(k)
                 if packed[k]:
-                    message = unpack_message(message, min(CHUNK_BYTES, self._left))
+                    message = unpack_message(
+                        message, min(RECORDING.chunk_bytes, self._left)
+                    )
                     self._left -= len(message)
                 if converted[k]:
                     message = converted_from_ros1(
@@ -357,7 +352,7 @@ class McapFile(BagFile):
                     )
                 messages.append(message)
                 held += len(message)
-                if held > PORTION_BYTES:
+                if held > RECORDING.portion_bytes:
                     break
             end = first + len(messages)
             later = batch.log_time[end:].min(initial=batch.horizon)
@@ -377,7 +372,7 @@ class McapFile(BagFile):
 
     def _scan(self) -> None:
         position = len(self.magic)
-        left = RECORDS + self.size // RECORD_BYTES
+        left = MCAP.records + self.size // MCAP.record_bytes
         while position < self.size:
             head = self._read(position, _RECORD.size)
             opcode, length = (
@@ -409,7 +404,8 @@ class McapFile(BagFile):
             elif opcode in (SCHEMA, CHANNEL, STATISTICS) and end <= self.size:
                 # One that is too long is noted as damaged by its length.
                 self._describe(
-                    opcode, self._read(start, min(length, DESCRIPTION_BYTES + 1))
+                    opcode,
+                    self._read(start, min(length, RECORDING.description_bytes + 1)),
                 )
             if end > self.size:
                 return
@@ -441,7 +437,7 @@ class McapFile(BagFile):
 
     def _scan_run(self, position: int, end: int) -> int:
         """Note the run of messages outside chunks that begins here, and return its end."""
-        if end - position > CHUNK_BYTES:
+        if end - position > RECORDING.chunk_bytes:
             self.note(f"the message at byte {position} is too long and was left out")
             return end
         found, topics, stop = walk(
@@ -461,7 +457,7 @@ class McapFile(BagFile):
 
     def _messages(self, piece: Piece) -> Batch:
         """Read a piece, with channel numbers as topics. Damage is noted and left out."""
-        stored = self._read(piece.offset, min(piece.size, CHUNK_BYTES + 1))
+        stored = self._read(piece.offset, min(piece.size, RECORDING.chunk_bytes + 1))
         data, wrong = decompress(
             stored, piece.compression, piece.raw_size, piece.crc, piece.cut
         )
@@ -479,9 +475,9 @@ class McapFile(BagFile):
         what = {SCHEMA: "message definition", CHANNEL: "topic description"}.get(
             opcode, "summary"
         )
-        if len(content) > DESCRIPTION_BYTES:
+        if len(content) > RECORDING.description_bytes:
             self.note(
-                f"a {what} is longer than {DESCRIPTION_BYTES} bytes and was left out"
+                f"a {what} is longer than {RECORDING.description_bytes} bytes and was left out"
             )
             return
         stream = ReadDataStream(io.BytesIO(content))
@@ -501,13 +497,13 @@ class McapFile(BagFile):
         """Keep the first description with each number, within the limits."""
         if number in known:
             return
-        if len(name) > NAME:
+        if len(name) > RECORDING.name_length:
             self.note(
-                f"the name {name[:NAME]!r} is longer than {NAME} and was left out"
+                f"the name {name[: RECORDING.name_length]!r} is longer than {RECORDING.name_length} and was left out"
             )
-        elif len(known) == MOST_TOPICS:
+        elif len(known) == RECORDING.topics:
             self.note(
-                f"it describes more than {MOST_TOPICS} topics: the others were left out"
+                f"it describes more than {RECORDING.topics} topics: the others were left out"
             )
         else:
             known[number] = what

@@ -25,7 +25,7 @@ from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.recorder_clock import RecorderClock
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Bytes, Int
-from fdi_ros.system.files import FILES, open_regular
+from fdi_ros.system.files import RECORDING, open_regular
 from fdi_ros.system.text import first_of, shown
 from fdi_ros.system.yaml_file import read_yaml
 
@@ -301,7 +301,7 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
     if not path.is_dir():
         raise BagError(f"no recording at {path}{_nearly(path)}")
     if tables := tables_of(path):
-        return tables[:FILES]
+        return tables[: RECORDING.files]
     about = _metadata(path, damage)
     # One that is named twice is read once.
     names = dict.fromkeys(str(name) for name in about.get("relative_file_paths") or [])
@@ -321,11 +321,11 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
         raise BagError(
             f"{path} is a folder without .mcap, .db3, .csv or .tsv files{more}"
         )
-    if len(paths) > FILES:
+    if len(paths) > RECORDING.files:
         damage.add(
-            f"{len(paths)} files, expected at most {FILES}: the others were left out"
+            f"{len(paths)} files, expected at most {RECORDING.files}: the others were left out"
         )
-    return tuple(paths[:FILES])
+    return tuple(paths[: RECORDING.files])
 
 
 def _pieces_of_one(folder: Path) -> list[Path]:

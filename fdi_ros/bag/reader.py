@@ -44,8 +44,8 @@ from fdi_ros.core.sources import SOURCES, source_of_type
 from fdi_ros.errors import BagError
 from fdi_ros.monitor.inputs import other_input
 from fdi_ros.system.files import (
-    LATEST_TIME,
-    MOST_TOPICS,
+    RECORDING,
+    TIMES,
     max_unpacked_bytes,
     open_regular,
     scratch_folder,
@@ -155,9 +155,9 @@ class Recording:
         merged: dict[str, Topic] = {}
         for file in self._files:
             for topic in file.topics:
-                if len(merged) == MOST_TOPICS and topic.name not in merged:
+                if len(merged) == RECORDING.topics and topic.name not in merged:
                     self.damage.add(
-                        f"more than {MOST_TOPICS} topics: the others were left out"
+                        f"more than {RECORDING.topics} topics: the others were left out"
                     )
                     break
                 before = merged.get(topic.name)
@@ -242,7 +242,7 @@ class Recording:
                 progress=sum(walk.progress for walk in walks) / len(walks),
                 horizon=min(walk.horizon for walk in walks),
             )
-            possible = (batch.log_time >= 0) & (batch.log_time <= LATEST_TIME)
+            possible = (batch.log_time >= 0) & (batch.log_time <= TIMES.latest)
             if not possible.all():
                 self.damage.add(
                     "messages recorded before 1970 or after 2038, by their times, were left out"

@@ -30,11 +30,7 @@ from fdi_ros.bag.raw import Damage, Topic
 from fdi_ros.bag.recorder_clock import RecorderClock
 from fdi_ros.bag.ros1_message import converted_from_ros1
 from fdi_ros.errors import BagError
-from fdi_ros.system.files import (
-    CHUNK_BYTES,
-    PORTION_BYTES,
-    ROS1_INDEX_BYTES,
-)
+from fdi_ros.system.files import LOGS, RECORDING
 
 _ROS1_ERRORS = (
     *(ReaderError, SerdeError, struct.error, AssertionError, LookupError, ValueError),
@@ -51,12 +47,12 @@ _UNPACKERS = {
 class _Bounded(io.BufferedReader):
     """A file that limits the bytes read in total and at once."""
 
-    left = ROS1_INDEX_BYTES
+    left = LOGS.ros1_index_bytes
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read at most this many bytes."""
         self.left -= size or 0
-        if self.left < 0 or (size or 0) > PORTION_BYTES:
+        if self.left < 0 or (size or 0) > RECORDING.portion_bytes:
             raise ReaderError(
                 "its index, or a part of it, is larger than that of any recorder"
             )
@@ -137,7 +133,7 @@ class Ros1File(LibraryBag):
     def _unpacked(self, unpacker: Callable[[], Any] | None, data: bytes) -> bytes:
         """Unpack a chunk."""
         if unpacker is not None:
-            data = unpacker().decompress(data, CHUNK_BYTES)
+            data = unpacker().decompress(data, RECORDING.chunk_bytes)
         self._left -= len(data)
         if self._left < 0:
             raise ReaderError("it comes to more bytes than it should")

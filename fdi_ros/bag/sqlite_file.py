@@ -27,14 +27,7 @@ from fdi_ros.bag.library_bag import LibraryBag, Message
 from fdi_ros.bag.raw import NO_HORIZON, PACKED, Damage, Topic, unpack_message
 from fdi_ros.bag.recorder_clock import RecorderClock
 from fdi_ros.errors import BagError
-from fdi_ros.system.files import (
-    CHUNK_BYTES,
-    MOST_TOPICS,
-    NAME,
-    STEPS,
-    STEPS_PER_BYTE,
-    scratch_folder,
-)
+from fdi_ros.system.files import RECORDING, SQLITE, scratch_folder
 
 #: steps of SQLite from one look at the clock of signals and steps to the next
 _TICK = 10_000
@@ -53,7 +46,7 @@ class SqliteFile(LibraryBag):
         self._open = (
             contextlib.ExitStack()
         )  # to be closed: the database, then the folder of its copy
-        self._steps = STEPS + STEPS_PER_BYTE * self.size
+        self._steps = SQLITE.steps + SQLITE.steps_per_byte * self.size
         try:
             self._base = self._opened()
             self._check_tables()
@@ -105,7 +98,7 @@ class SqliteFile(LibraryBag):
         base.execute("PRAGMA trusted_schema = OFF")
         base.execute("PRAGMA cell_size_check = ON")
         if hasattr(base, "setlimit"):
-            base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2 * CHUNK_BYTES)
+            base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2 * RECORDING.chunk_bytes)
         return base
 
     def _copied(self, log: Path) -> Path:
@@ -174,12 +167,12 @@ class SqliteFile(LibraryBag):
             name, kind, encoding = map(str, about)
             if (
                 not isinstance(number, int)
-                or max(map(len, (name, kind, encoding))) > NAME
+                or max(map(len, (name, kind, encoding))) > RECORDING.name_length
             ):
                 self.note("a topic description is damaged and was left out")
-            elif len(found) == MOST_TOPICS:
+            elif len(found) == RECORDING.topics:
                 self.note(
-                    f"it has more than {MOST_TOPICS} topics: the others were left out"
+                    f"it has more than {RECORDING.topics} topics: the others were left out"
                 )
                 break
             else:
@@ -235,12 +228,12 @@ class SqliteFile(LibraryBag):
     def _message(self, row: int) -> Any:
         """Return a message as sent. A damaged one is empty, which counts as malformed."""
         one = "SELECT data FROM messages WHERE rowid = ? AND length(data) <= ?"
-        (content,) = next(self._query(one, (row, CHUNK_BYTES)), (None,))
+        (content,) = next(self._query(one, (row, RECORDING.chunk_bytes)), (None,))
         if content is None:
             self.note(
-                f"messages of none or more than {CHUNK_BYTES} bytes were left out"
+                f"messages of none or more than {RECORDING.chunk_bytes} bytes were left out"
             )
         # Each may be compressed by itself: no message begins like that.
         if not isinstance(content, bytes) or not content.startswith(PACKED):
             return content
-        return unpack_message(content, CHUNK_BYTES)
+        return unpack_message(content, RECORDING.chunk_bytes)

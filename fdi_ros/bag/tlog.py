@@ -47,9 +47,7 @@ from fdi_ros.mavlink.protocol import (
 )
 from fdi_ros.mavlink.vehicle import dialect
 from fdi_ros.model.samples import Int
-from fdi_ros.system.files import (
-    TLOG_BYTES,
-)
+from fdi_ros.system.files import LOGS
 
 _IMUS = tuple(message.name for message in IMU_MESSAGES.values())
 _OTHER_MESSAGES = (
@@ -129,7 +127,7 @@ class Tlog(LibraryLog):
     first_imu = 1
     #: many ground stations ask for no more than 10 Hz
     slowest = 5.0
-    most = TLOG_BYTES
+    most = LOGS.tlog_bytes
     together = 1 << 16
 
     _read_last: ClassVar[_Read] = (b"", {}, {})

@@ -43,13 +43,7 @@ from fdi_ros.bag.modes import px4_navigation_mode
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system import require
-from fdi_ros.system.files import (
-    ULOG_BYTES,
-    ULOG_FIELDS,
-    ULOG_MESSAGE_COST,
-    ULOG_OTHER_BYTES,
-    ULOG_TOPIC_COST,
-)
+from fdi_ros.system.files import LOGS
 from fdi_ros.system.text import figures
 
 #: bytes of a message before its content: two of its size, one of its kind
@@ -98,13 +92,17 @@ class _Bounded(io.BytesIO):
         super().__init__(data)
         self.reached = 0  # up to there the file was read, bytes
         self.cut = False  # whether the file ends within a message
-        self._left = ULOG_OTHER_BYTES
+        self._left = LOGS.ulog_other_bytes
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read bytes. A read of three bytes is the head of a message."""
         data = super().read(size) if self._left > 0 else b""
         if size == _HEAD and len(data) == _HEAD and data[2] != _DATA:
-            cost = ULOG_TOPIC_COST if data[2] == _SUBSCRIPTION else ULOG_MESSAGE_COST
+            cost = (
+                LOGS.ulog_topic_cost
+                if data[2] == _SUBSCRIPTION
+                else LOGS.ulog_message_cost
+            )
             self._left -= (data[0] | data[1] << 8) + cost
         self.cut = len(data) < (size or 0) and not (size == _HEAD and not data)
         self.reached = max(self.reached, self.tell())
@@ -125,7 +123,7 @@ class Ulog(LibraryLog):
     )
     coarse = _STATUS
     selected = _SELECTED
-    most = ULOG_BYTES
+    most = LOGS.ulog_bytes
     together = 1 << 14
 
     def load(self, data: bytes) -> dict[Source, Columns]:
@@ -323,10 +321,11 @@ def _parsed(file: _Bounded, path: str) -> Any:
             ).message_formats
             known: dict[str, int] = {}
             if any(
-                count_fields(formats, name, known) > ULOG_FIELDS for name in formats
+                count_fields(formats, name, known) > LOGS.ulog_fields
+                for name in formats
             ):
                 raise BagError(
-                    f"{path} defines a message of more than {ULOG_FIELDS} fields"
+                    f"{path} defines a message of more than {LOGS.ulog_fields} fields"
                 )
             return ULog(file)
     except ULogIncompatibleFlagException as error:
@@ -343,15 +342,15 @@ def count_fields(
     """Count the fields of a message with nested formats, up to one beyond the limit."""
     if name not in known:
         if depth > _DEEPEST:
-            return ULOG_FIELDS + 1
+            return LOGS.ulog_fields + 1
         # A format within itself has no end.
-        known[name] = ULOG_FIELDS + 1
+        known[name] = LOGS.ulog_fields + 1
         total = sum(
             max(1, length)
             * (count_fields(formats, kind, known, depth + 1) if kind in formats else 1)
             for kind, length, _ in formats[name].fields
         )
-        known[name] = min(total, ULOG_FIELDS + 1)
+        known[name] = min(total, LOGS.ulog_fields + 1)
     return known[name]
 
 

@@ -43,7 +43,7 @@ from fdi_ros.config.settings import (
 from fdi_ros.config.unit_names import unit_names
 from fdi_ros.errors import ConfigError
 from fdi_ros.system import find_shipped
-from fdi_ros.system.files import NAME
+from fdi_ros.system.files import RECORDING
 from fdi_ros.system.text import did_you_mean, html_table, shown
 from fdi_ros.system.yaml_file import parse_yaml, read_yaml
 
@@ -255,7 +255,7 @@ _TOPIC = re.compile(f"(?:/|~/)?{_TOKEN}(?:/{_TOKEN})*")
 
 def is_topic(name: str) -> bool:
     """Whether a text is a valid ROS topic name, substitutions in braces included."""
-    return len(name) <= NAME and _TOPIC.fullmatch(name) is not None
+    return len(name) <= RECORDING.name_length and _TOPIC.fullmatch(name) is not None
 
 
 def is_plain_name(name: str) -> bool:
@@ -329,9 +329,9 @@ def _check_names(config: Config) -> None:
     named |= {"hardware_id": (config.hardware_id,), "body_frame": (config.body_frame,)}
     for parameter, names in named.items():
         for name in names:
-            if len(name) > NAME or not name.isprintable():
+            if len(name) > RECORDING.name_length or not name.isprintable():
                 raise ConfigError(
-                    f"{parameter}: {name!r} is no name: expected at most {NAME} printable characters"
+                    f"{parameter}: {name!r} is no name: expected at most {RECORDING.name_length} printable characters"
                 )
 
 

@@ -26,7 +26,7 @@ from fdi_ros.compiling.compiled import MAX_CHANNELS, compiled
 from fdi_ros.core.records import OutputRow
 from fdi_ros.errors import FdiError
 from fdi_ros.model.samples import Array, Bytes, Int
-from fdi_ros.system.files import NAME
+from fdi_ros.system.files import RECORDING
 
 GOOD, NO_CDR, NO_HEADER, CUT_VALUES, BAD_STAMP, FIRST_OWN = range(6)
 """Results of reading a message. From `FIRST_OWN` on each source has its own codes."""
@@ -178,7 +178,9 @@ def frame_of(data: bytes) -> str:
         return ""
     (length,) = struct.unpack_from(f"{byte_order(data)}I", data, begin - 4)
     return (
-        data[begin : begin + min(length, NAME)].rstrip(b"\0").decode(errors="replace")
+        data[begin : begin + min(length, RECORDING.name_length)]
+        .rstrip(b"\0")
+        .decode(errors="replace")
     )
 
 

@@ -33,7 +33,7 @@ from fdi_ros.report.layout import (
     table,
     told,
 )
-from fdi_ros.system.files import NAME
+from fdi_ros.system.files import RECORDING
 from fdi_ros.system.text import date_of, figures, listed, percent, shown
 
 #: intervals longer than this many usual ones are gaps
@@ -311,8 +311,8 @@ def _take_frames(report: TopicReport, batch: Batch, rows: Int) -> None:
     if not len(rows):
         return
     frame = frame_of(batch.message(int(rows[0])))
-    # A frame is followed by doubles of more than NAME bytes, so each message is this long.
-    size = min(len(frame.encode()) + 1, NAME)
+    # A frame is followed by doubles of more than RECORDING.name_length bytes, so each message is this long.
+    size = min(len(frame.encode()) + 1, RECORDING.name_length)
     begin = batch.offset[rows] + ENCAPSULATION + 12
     frames = batch.buffer[begin[:, np.newaxis] + np.arange(size)]
     report.frame = frame if report.frame is None else report.frame

@@ -29,7 +29,7 @@ from fdi_ros.monitor.output import OUTPUTS, Encoder, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.monitor.recent import RecentHealth
 from fdi_ros.replay.run import Sink
-from fdi_ros.system.files import LATEST_TIME
+from fdi_ros.system.files import TIMES
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -223,7 +223,7 @@ class OutputBag(Sink):
 
     def _time(self, stamp: int) -> int:
         """Return the time of recording for a sample, ns. Unlike stamps, it must be plausible."""
-        return min(max(stamp + self._later, 0), LATEST_TIME)
+        return min(max(stamp + self._later, 0), TIMES.latest)
 
     def _topic(self, name: str, kind: str) -> Connection:
         """Add a topic with its name without remapping."""

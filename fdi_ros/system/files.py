@@ -27,7 +27,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from fdi_ros.errors import BagError
 
@@ -35,68 +35,130 @@ from fdi_ros.errors import BagError
 # All limits are far above the needs of gyros. No input takes 1 GB of memory or runs
 # without end. docs/security.md describes the effect of each limit.
 
-#: of one chunk or message of a recording, decompressed
-CHUNK_BYTES = 1 << 26
-#: messages of a database are handed on when they hold so much
-PORTION_BYTES = 1 << 24
-#: bytes that any recording may unpack to, plus this multiple of its size
-FREE_BYTES, FREE_RATIO = (
-    1 << 28,
-    50,
-)
-RECORDS, RECORD_BYTES = 300_000, 4096
-"""Records outside chunks in an MCAP file, and bytes of the file for each further
-record.
-"""
-#: topics of one recording, and descriptions of topics and of types in one file
-MOST_TOPICS = 4096
-#: read from one chunk at most
-DESCRIPTIONS = 4 * MOST_TOPICS
-#: of the description of a topic or a type
-DESCRIPTION_BYTES = 1 << 20
-#: characters of the name of a topic or a type, as in DDS
-NAME = 255
-#: files of one recording, all open together
-FILES = 800
-#: latest time of recording, ns: the largest stamp of ROS 2, in 2038
-LATEST_TIME = 2**31 * 10**9 - 1
-EARLIEST = 946_684_800 * 10**9
-"""Earliest date, the year 2000, ns. Earlier times count from the start of a system."""
-LOG_SPAN = 10**13
-"""Longest time of a flight log, us: 115 days since the start of the autopilot."""
-ULOG_BYTES, TLOG_BYTES = 1 << 28, 1 << 27
-"""Size of a log that a library reads whole: hours of PX4, a day of telemetry."""
-ULOG_FIELDS, ULOG_OTHER_BYTES, ULOG_MESSAGE_COST, ULOG_TOPIC_COST = (
-    1000,
-    1 << 26,
-    1 << 8,
-    1 << 16,
-)
-"""Limits of ULog: fields of a message, bytes of messages without samples, and the cost
-in bytes of the objects that pyulog makes of each message and of each topic.
-"""
-ROS1_INDEX_BYTES = 48 << 20
-"""Index of a ROS 1 bag, 12 bytes per message: an hour at 1100 messages per second."""
-#: of the line of names of a table of text
-CSV_LINE_BYTES = 1 << 20
-#: columns of a table, as many as topics
-CSV_COLUMNS = 4096
-STEPS, STEPS_PER_BYTE = 10_000_000, 20
-"""SQLite steps that any query may take, plus this number per byte of the file."""
+
+class RecordingLimits(NamedTuple):
+    """Limits of reading any recording."""
+
+    #: largest chunk or message of a recording, decompressed
+    chunk_bytes: int = 1 << 26
+    #: messages of a database are handed on when they hold so much
+    portion_bytes: int = 1 << 24
+    #: bytes that any recording may unpack to, beside `free_ratio` times its size
+    free_bytes: int = 1 << 28
+    #: multiple of its size that a recording may unpack to
+    free_ratio: int = 50
+    #: topics of one recording, and descriptions of topics and of types in one file
+    topics: int = 4096
+    #: longest description of a topic or a type
+    description_bytes: int = 1 << 20
+    #: characters of the name of a topic or a type, as in DDS
+    name_length: int = 255
+    #: files of one recording, all open together
+    files: int = 800
+
+
+RECORDING = RecordingLimits()
+
+
+class McapLimits(NamedTuple):
+    """Limits of reading an MCAP file."""
+
+    #: records outside chunks
+    records: int = 300_000
+    #: bytes of the file for each further record
+    record_bytes: int = 4096
+    #: descriptions read from one chunk: four times the topics
+    descriptions: int = 4 * RECORDING.topics
+
+
+MCAP = McapLimits()
+
+
+class Times(NamedTuple):
+    """Times that a recording may have."""
+
+    #: latest time of recording, ns: the largest stamp of ROS 2, in 2038
+    latest: int = 2**31 * 10**9 - 1
+    #: Earliest date, the year 2000, ns. Earlier times count from the start of a
+    #: system.
+    earliest: int = 946_684_800 * 10**9
+    #: Longest time of a flight log, us: 115 days since the start of the autopilot.
+    log_span: int = 10**13
+
+
+TIMES = Times()
+
+
+class LogLimits(NamedTuple):
+    """Limits of logs and recordings that a library reads."""
+
+    #: largest ULog, bytes: hours of PX4
+    ulog_bytes: int = 1 << 28
+    #: largest tlog, bytes: a day of telemetry
+    tlog_bytes: int = 1 << 27
+    #: fields of a message
+    ulog_fields: int = 1000
+    #: bytes of messages without samples
+    ulog_other_bytes: int = 1 << 26
+    #: bytes of the objects that pyulog makes of each message
+    ulog_message_cost: int = 1 << 8
+    #: bytes of the objects that pyulog makes of each topic
+    ulog_topic_cost: int = 1 << 16
+    #: index of a ROS 1 bag, 12 bytes per message: an hour at 1100 messages per
+    #: second
+    ros1_index_bytes: int = 48 << 20
+
+
+LOGS = LogLimits()
+
+
+class TableLimits(NamedTuple):
+    """Limits of reading a table of text."""
+
+    #: longest line of names, bytes
+    line_bytes: int = 1 << 20
+    #: columns of a table, as many as topics
+    columns: int = 4096
+
+
+TABLE = TableLimits()
+
+
+class SqliteLimits(NamedTuple):
+    """SQLite steps that any query may take."""
+
+    #: steps for a file of any size
+    steps: int = 10_000_000
+    #: further steps for each byte of the file
+    steps_per_byte: int = 20
+
+
+SQLITE = SqliteLimits()
+
 
 #: of the description of a robot
 URDF_BYTES = 1 << 22
-YAML_BYTES = 1 << 20
-#: values of a YAML file, those behind aliases counted each time
-YAML_NODES = 50_000
-YAML_DEPTH = 50
-#: characters of a number
-YAML_DIGITS = 64
+
+
+class YamlLimits(NamedTuple):
+    """Limits of reading a YAML file."""
+
+    #: longest file, bytes
+    length: int = 1 << 20
+    #: values of a file, those behind aliases counted each time
+    nodes: int = 50_000
+    #: deepest nesting
+    depth: int = 50
+    #: characters of a number
+    digits: int = 64
+
+
+YAML = YamlLimits()
 
 
 def max_unpacked_bytes(size: int) -> int:
     """Return the bytes that a recording of this size may unpack to."""
-    return FREE_BYTES + FREE_RATIO * size
+    return RECORDING.free_bytes + RECORDING.free_ratio * size
 
 
 # What is believed -----------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import re
 from collections.abc import Collection, Iterable, Sequence
 from datetime import datetime, timezone
 
-from fdi_ros.system.files import EARLIEST, LATEST_TIME
+from fdi_ros.system.files import TIMES
 
 #: choices that are listed beside the closest one
 MOST_CHOICES = 30
@@ -175,6 +175,6 @@ def date_of(ns: int) -> datetime | None:
     """Return the date of a stamp, UTC, None if the stamp counts from the start of a system."""
     return (
         datetime.fromtimestamp(ns * 1e-9, timezone.utc)
-        if EARLIEST <= ns <= LATEST_TIME
+        if TIMES.earliest <= ns <= TIMES.latest
         else None
     )

@@ -13,13 +13,7 @@ import yaml
 
 from fdi_ros.errors import FdiError
 from fdi_ros.system import shipped_files
-from fdi_ros.system.files import (
-    YAML_BYTES,
-    YAML_DEPTH,
-    YAML_DIGITS,
-    YAML_NODES,
-    open_regular,
-)
+from fdi_ros.system.files import YAML, open_regular
 from fdi_ros.system.text import shown
 
 try:
@@ -59,10 +53,10 @@ class _Loader(_SafeLoader):  # type: ignore[misc]
     def number(self, node: yaml.Node) -> int | float:
         """Value of a number."""
         text = self.construct_scalar(node)
-        if len(text) > YAML_DIGITS:
+        if len(text) > YAML.digits:
             raise _Refused(
                 node.start_mark,
-                f"a number of {len(text)} characters, expected at most {YAML_DIGITS}",
+                f"a number of {len(text)} characters, expected at most {YAML.digits}",
             )
         kind = node.tag.removeprefix(_TAG)
         try:
@@ -100,9 +94,9 @@ def read_yaml(path: str | Path, what: str, error: type[FdiError]) -> Any:
     """
     try:
         with open_regular(path) as file:
-            data = file.read(YAML_BYTES + 1)
-        if len(data) > YAML_BYTES:
-            raise error(f"{what} {path} is longer than {YAML_BYTES} bytes")
+            data = file.read(YAML.length + 1)
+        if len(data) > YAML.length:
+            raise error(f"{what} {path} is longer than {YAML.length} bytes")
         text = data.decode("utf-8")
     except UnicodeDecodeError as refused:
         raise error(f"{what} {path} is not YAML: {refused}") from refused
@@ -200,9 +194,9 @@ def _check_size(text: str) -> None:
             outer.append(_Collection(event, before))
         elif anchor:
             sizes[anchor] = count - before
-        if len(outer) > YAML_DEPTH:
-            raise _Refused(event.start_mark, f"nested deeper than {YAML_DEPTH}")
-        if count > YAML_NODES:
+        if len(outer) > YAML.depth:
+            raise _Refused(event.start_mark, f"nested deeper than {YAML.depth}")
+        if count > YAML.nodes:
             raise _Refused(
-                event.start_mark, f"more than {YAML_NODES} values, aliases followed"
+                event.start_mark, f"more than {YAML.nodes} values, aliases followed"
             )

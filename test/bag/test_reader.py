@@ -36,7 +36,7 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples, check_sample_rate, joined
 from fdi_ros.config.config import Config
 from fdi_ros.errors import BagError
-from fdi_ros.system.files import ROS1_INDEX_BYTES
+from fdi_ros.system.files import LOGS
 
 CONFIG = Config.from_parameters(PARAMETERS)
 SAMPLES = 300
@@ -395,7 +395,7 @@ def test_a_chunk_that_unpacks_to_more_than_it_may_is_not_unpacked(tmp_path):
 def test_an_index_without_end_is_refused(tmp_path, monkeypatch):
     """Its chunks are one chunk, again and again: each has the whole index."""
     # A twentieth of the bound, which takes half a minute to reach.
-    monkeypatch.setattr(ros1_file._Bounded, "left", ROS1_INDEX_BYTES // 20)
+    monkeypatch.setattr(ros1_file._Bounded, "left", LOGS.ros1_index_bytes // 20)
     path = write_ros1(tmp_path / "bag.bag", flight(2000)[0])
     data = path.read_bytes()
     at = data.index(b"chunk_count=") + 12
