@@ -56,11 +56,12 @@ from fdi_ros.model.samples import Array, Bytes, Int
 Rows = NDArray[np.void]
 #: bytes that are read at once, much more than the longest record
 _PORTION_BYTES = 1 << 22
-#: number of the message that describes the others, and its bytes
-_FMT = 128
-_FMT_SIZE = 89
 #: bytes of a record before its values
 _RECORD_HEAD = 3
+#: number of the message that describes the others, its content, and bytes of the record
+_FMT = 128
+_DESCRIPTION = struct.Struct("<BB4s16s64s")
+_FMT_SIZE = _RECORD_HEAD + _DESCRIPTION.size
 _FIELD_TYPES = (
     {"b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "c": "<i2", "C": "<u2"}
     | {
@@ -332,7 +333,7 @@ class DataflashLog(FlightLog):
 
     def _describe(self, content: bytes) -> None:
         """Take a FMT record, unless an earlier one defined the same message."""
-        number, size, *texts = struct.unpack("<BB4s16s64s", content)
+        number, size, *texts = _DESCRIPTION.unpack(content)
         name, types, columns = (
             text.partition(b"\0")[0].decode("ascii", "replace") for text in texts
         )

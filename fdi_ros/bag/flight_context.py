@@ -13,12 +13,25 @@ from numpy.typing import NDArray
 
 from fdi_ros.model.samples import Array, Int
 
-MOST_VALUES = 2048
-"""Values that are kept of a course. Beyond, every second one is dropped."""
-MOST_MODES = 500
-"""Changes of the flight mode that are kept: the first ones."""
-INTERVAL_US = 200_000
-"""Shortest interval of the values that are kept, us."""
+
+class ContextLimits(NamedTuple):
+    """Limits of the context of a flight beside its rates."""
+
+    #: values of a course. Beyond, every second one is dropped
+    values: int = 2048
+    #: shortest interval of the values of a course, us
+    interval_us: int = 200_000
+    #: changes of the flight mode: the first ones
+    modes: int = 500
+    #: texts of a log: the first ones
+    texts: int = 1000
+    #: largest throttle. Larger values are damage: those of old logs pass 1000 a
+    #: little
+    throttle: float = 1500.0
+
+
+KEPT = ContextLimits()
+
 COLDEST, HOTTEST = -60.0, 130.0
 """Range of possible temperatures of an IMU, degC."""
 
@@ -61,7 +74,7 @@ class Thinned:
     def __init__(self, low: float, high: float) -> None:
         """``low`` and ``high``: range of possible values. Others are left out."""
         self._range = low, high
-        self._interval = INTERVAL_US
+        self._interval = KEPT.interval_us
         self._stamps: list[int] = []
         self._values: list[float] = []
 
@@ -78,7 +91,7 @@ class Thinned:
                 continue
             self._stamps.append(at)
             self._values.append(float(value[k]))
-            if len(self._stamps) > MOST_VALUES:
+            if len(self._stamps) > KEPT.values:
                 del self._stamps[1::2], self._values[1::2]
                 self._interval *= 2
 

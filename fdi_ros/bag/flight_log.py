@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from fdi_ros.bag.flight_context import (
     COLDEST,
     HOTTEST,
-    MOST_MODES,
+    KEPT,
     Course,
     FlightContext,
     Mode,
@@ -51,18 +51,36 @@ SETTINGS = 'docs/flight_logs.md, "Settings of the logger"'
 MESSAGES_READ = 'docs/flight_logs.md, "messages read"'
 #: from FRD
 FLU = np.array([1.0, -1.0, -1.0])
-#: samples by which the rate of a source can be judged
-_FEWEST = 20
-#: means of a coarse check: the shortest log has few
-_FEWEST_COARSE = 3
-#: largest step back of time within one log, us
-_MAX_STEP_BACK = 1_000_000
-#: samples whose median time marks the progress of a log, robust to damaged times
-_NEIGHBOURS = 17
-#: lowest rate of logged means, Hz
-_COARSE_RATE = 0.5
-#: distance from neighbours at which a time is damaged, us
-_MAX_TIME_STEP = 10_000_000
+
+
+class _Judged(NamedTuple):
+    """How many samples, and how fast, a source must have to be judged."""
+
+    #: samples by which the rate of a source can be judged
+    samples: int = 20
+    #: means of a coarse check: the shortest log has few
+    means: int = 3
+    #: lowest rate of logged means, Hz
+    mean_rate: float = 0.5
+
+
+_JUDGED = _Judged()
+
+
+class _Damage(NamedTuple):
+    """From where the times of a log are damaged."""
+
+    #: largest step back of time within one log, us
+    step_back: int = 1_000_000
+    #: distance from neighbours at which a time is damaged, us
+    step: int = 10_000_000
+    #: samples whose median time marks the progress of a log, robust to damaged
+    #: times
+    neighbours: int = 17
+
+
+_DAMAGE = _Damage()
+
 #: messages per batch, few enough that a chunk of a converted bag covers a short time
 _LOG_BATCH = 1 << 10
 #: instances of one kind, more than any autopilot has, that are looked at for copies
@@ -79,10 +97,6 @@ LARGEST_DEVICE = 1 << 32
 GPS_FIX_3D = 3
 #: full throttle, by the message: 1, per cent, or thousandths in old logs
 _FULL = (1.0, 100.0, 1000.0)
-#: larger values are damage: throttles of old logs pass 1000 a little
-_MOST_THROTTLE = 1500.0
-#: texts of a log that are kept: the first ones
-_MOST_TEXTS = 1000
 
 
 class Source(NamedTuple):
@@ -133,7 +147,7 @@ class Track:
     #: lowest acceptable rate, samples per second
     slowest: float
     #: samples by which its rate can be judged
-    fewest: int = _FEWEST
+    fewest: int = _JUDGED.samples
     #: number of samples so far
     count: int = 0
     #: samples that follow the one before without a gap
@@ -168,17 +182,17 @@ class Track:
         A second log begins there.
         """
         samples = _joined([self.recent, samples])
-        self.recent = samples[1 - _NEIGHBOURS :]
+        self.recent = samples[1 - _DAMAGE.neighbours :]
         if not len(samples):
             return 0
         come = stamp = samples["stamp"]
-        if (np.abs(np.diff(stamp)) > _MAX_STEP_BACK).any():
-            come = _medians(stamp, _NEIGHBOURS)
+        if (np.abs(np.diff(stamp)) > _DAMAGE.step_back).any():
+            come = _medians(stamp, _DAMAGE.neighbours)
         first = int(come[0]) if self.come is None else self.come
         before = np.maximum.accumulate(np.append(first, come[:-1]))
         self.come = max(first, int(come.max()))
         # A jump ahead by years is a second log too: its times became dates, or ceased.
-        behind = (come < before - _MAX_STEP_BACK) | (come - before > TIMES.log_span)
+        behind = (come < before - _DAMAGE.step_back) | (come - before > TIMES.log_span)
         return int(samples["end"][np.argmax(behind)]) if behind.any() else 0
 
     @property
@@ -288,7 +302,7 @@ class FlightLog(BagFile):
         self.hardware_id = ""
         self.said: list[LogText] = []  # texts of the autopilot up to here, stamps in us
         self.modes: list[Mode] = []  # changes of the flight mode, stamps in us
-        self.throttle = Thinned(0.0, _MOST_THROTTLE)
+        self.throttle = Thinned(0.0, KEPT.throttle)
         self.temperatures: defaultdict[int, Thinned] = defaultdict(
             lambda: Thinned(COLDEST, HOTTEST)
         )  # of each instance, degC
@@ -303,13 +317,13 @@ class FlightLog(BagFile):
         board = _BOARD.fullmatch(text.strip())
         if board and not self.hardware_id:
             self.hardware_id = board[1]
-        if len(self.said) < _MOST_TEXTS and (line := " ".join(text.split())):
+        if len(self.said) < KEPT.texts and (line := " ".join(text.split())):
             self.said.append(LogText(stamp, kind, line))
 
     def add_mode(self, stamp: int, name: str) -> None:
         """Take the flight mode at a time, us."""
         changed = not self.modes or self.modes[-1].name != name
-        if changed and len(self.modes) < MOST_MODES:
+        if changed and len(self.modes) < KEPT.modes:
             self.modes.append(Mode(stamp, name))
 
     def take_parameter(self, name: str, value: float) -> None:
@@ -452,7 +466,7 @@ class FlightLog(BagFile):
     def _track(self, source: Source) -> Track:
         """Return the track of a source."""
         coarse = source.kind == self.coarse
-        new = Track(_COARSE_RATE, _FEWEST_COARSE) if coarse else Track(self.slowest)
+        new = Track(_JUDGED.mean_rate, _JUDGED.means) if coarse else Track(self.slowest)
         return self._tracks.setdefault(source, new)
 
     def _end_at(self, step: int) -> None:
@@ -469,9 +483,9 @@ class FlightLog(BagFile):
         good = ((stamp >= 0) & (stamp <= TIMES.log_span)) | (
             (stamp >= TIMES.earliest // 1000) & (stamp <= TIMES.latest // 1000)
         )
-        if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _MAX_TIME_STEP).any():
+        if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _DAMAGE.step).any():
             # Most of five neighbours are right, and a gap has neighbours on both sides.
-            good &= np.abs(stamp - _medians(stamp, 5)) <= _MAX_TIME_STEP
+            good &= np.abs(stamp - _medians(stamp, 5)) <= _DAMAGE.step
         if good.all():
             return samples
         self.note("samples with impossible times were left out")
@@ -580,14 +594,16 @@ class FlightLog(BagFile):
         has = "; ".join((*there, *unread))
         if not unread and max(map(len, kinds.values())) < self.fewest_imus:
             return f": {self.one_imu.format(has)}"
-        needed = f"two IMUs or more, each with {_FEWEST} samples or more at {self.slowest:g} Hz or more"
+        needed = f"two IMUs or more, each with {_JUDGED.samples} samples or more at {self.slowest:g} Hz or more"
         return f" has too few samples to compare two IMUs: it has {has}; needed: {needed}. What to do: {setting}"
 
 
 def _logged(kind: str, tracks: Sequence[Track]) -> str:
     """Describe how a kind of message is logged."""
-    fastest = max(tracks, key=lambda track: (track.count >= _FEWEST, track.rate))
-    few = f", {fastest.count} samples" if 1 < fastest.count < _FEWEST else ""
+    fastest = max(
+        tracks, key=lambda track: (track.count >= _JUDGED.samples, track.rate)
+    )
+    few = f", {fastest.count} samples" if 1 < fastest.count < _JUDGED.samples else ""
     return (
         f"{kind} of {len(tracks)} IMU{'s' * (len(tracks) > 1)} {fastest.figures}{few}"
     )

@@ -56,11 +56,11 @@ CHUNK = int(Opcode.CHUNK)
 STATISTICS = int(Opcode.STATISTICS)
 #: encoding of messages of ROS 1, as in a converted .bag
 ROS1 = "ros1"
-#: bytes of a record before its content: opcode, length of the content
-_PREFIX = 9
-#: bytes of a message record before the message: channel, sequence, log time, publish
-#: time
-_MESSAGE_HEAD = 22
+#: opcode of a record, and the length of its content
+_RECORD = struct.Struct("<BQ")
+_PREFIX = _RECORD.size
+#: channel, sequence, log time and publish time of a message record
+_MESSAGE_HEAD = struct.calcsize("<HIQQ")
 
 
 def decompress(
@@ -180,7 +180,6 @@ def ros_type(name: str) -> str:
 
 
 T = TypeVar("T")
-_RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
 #: messages outside chunks are read in runs of at most this many bytes
 _RUN = 1 << 18

@@ -19,7 +19,7 @@ from bag.recordings import IMU, STORE, bounded
 from pymavlink.DFReader import DFReader_binary
 
 from fdi_ros.bag import dataflash, flight_log, ulog
-from fdi_ros.bag.flight_context import MOST_VALUES, Thinned
+from fdi_ros.bag.flight_context import KEPT, Thinned
 from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.core.sources import ImuSource
@@ -759,7 +759,7 @@ def test_a_course_keeps_its_extent_in_bounded_memory():
         course.add(part, np.full(len(part), 20.0))
     course.add(stamp[-1:], np.array([np.nan]))
     kept = course.course(shift=5)
-    assert MOST_VALUES // 2 - 1 <= len(kept.stamp) <= MOST_VALUES
+    assert KEPT.values // 2 - 1 <= len(kept.stamp) <= KEPT.values
     assert kept.stamp[0] == 5000
     assert kept.stamp[-1] > 0.99e3 * stamp[-1]
     assert (np.diff(kept.stamp) > 0).all()
