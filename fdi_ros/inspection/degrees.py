@@ -18,13 +18,39 @@ from fdi_ros.inspection.tilt import sum_of, swings_of
 from fdi_ros.inspection.topics import (
     TopicReport,
 )
-from fdi_ros.inspection.turns import LEAST_ROTATION, SHARED
+from fdi_ros.inspection.turns import TURNS
 from fdi_ros.model.samples import LARGEST_GYRO_RANGE, Array
 from fdi_ros.report.layout import DEGREES
 from fdi_ros.system.text import figures, shown
 
-#: largest relative distance of a factor from a degree's
-NEAR = 0.2
+
+class _DegreeSigns(NamedTuple):
+    """What shows that a unit sends deg/s in place of rad/s."""
+
+    #: largest relative distance of a factor from a degree
+    near: float = 0.2
+    #: time beyond every gyro's range, s: less is a shock or damage
+    fast_time: float = 0.5
+    #: share of the recording beyond every range, from which on values may be of any
+    #: size
+    fast_share: float = 0.01
+    #: share of a recording at rest that is much of it
+    still: float = 0.3
+    #: share of a recording at rest that is all of it
+    always_still: float = 0.95
+    #: shortest rest, s: in a flight with vibration less may be chance
+    least_rest: float = 4.0
+    #: noise of a sample at rest, rad/s, that no gyro has
+    noisiest: float = 0.02
+    #: smallest rotation in gentle motion, rad/s, of which three quantiles are
+    #: compared
+    gentle_rotation: float = 0.01
+    #: the same rotation over the noise of its mean
+    gentle_over_noise: float = 10.0
+
+
+SIGNS = _DegreeSigns()
+
 #: of the rates of a unit, that are compared with those of another
 QUANTILES = (
     0.5,
@@ -33,30 +59,26 @@ QUANTILES = (
     0.97,
     0.99,
 )
-#: time beyond every gyro's range, s: less is a shock or damage
-FAST_TIME = 0.5
-#: share of the recording beyond it, from which on values may be of any size
-FAST_SHARE = 0.01
-#: much of a recording, and all of a recording, as shares
-STILL, ALWAYS_STILL = 0.3, 0.95
-#: shortest rest, s: in a flight with vibration less may be chance
-LEAST_REST = 4.0
-#: noise of a sample at rest, rad/s, that no gyro has
-NOISIEST = 0.02
-#: smallest rotation in gentle motion, rad/s, and over the noise of its mean, of which
-#: three quantiles are compared
-GENTLE_ROTATION, GENTLE_OVER_NOISE = 0.01, 10.0
-#: Swings of gravity that rates in rad/s foretell, rad: a multicopter and a pendulum swing
-#: with gravity, and so far only if they fly or swing hard.
-LEAST_SWING = 0.3
-#: Largest change of the size of the specific force, as a share of it, over the square of
-#: the swings: about 1 on a pendulum and 0.35 in a multicopter that keeps its height.
-LARGEST_CHANGE = 0.1
-#: Share of the swings of the accelerometers that the rates explain. In healthy recordings
-#: in which they are 57 times too small, by chance, it is 0.01.
-LEAST_SHARED = 0.5
-#: windows that show so, each by itself
-LEAST_SWUNG = 2
+
+
+class _SwingSigns(NamedTuple):
+    """Which swings of gravity show the unit of the rates."""
+
+    #: swings that rates in rad/s foretell, rad: a multicopter and a pendulum swing
+    #: with gravity, and so far only if they fly or swing hard
+    least_size: float = 0.3
+    #: largest change of the size of the specific force, as a share of it, over the
+    #: square of the swings: about 1 on a pendulum and 0.35 in a multicopter that
+    #: keeps its height
+    largest_change: float = 0.1
+    #: share of the swings of the accelerometers that the rates explain. In healthy
+    #: recordings in which they are 57 times too small, by chance, it is 0.01
+    least_shared: float = 0.5
+    #: windows that show so, each by itself
+    least_windows: int = 2
+
+
+SWINGS = _SwingSigns()
 
 
 def in_degrees(
@@ -75,10 +97,12 @@ def in_degrees(
     for (fast_one, fast), (slow_one, slow) in itertools.product(
         zip(chosen, rates, strict=True), repeat=2
     ):
-        gentle = max(GENTLE_ROTATION, GENTLE_OVER_NOISE * _mean_noise(slow_one))
-        factor = _degrees_factor(fast, slow, LEAST_ROTATION, 2) or _degrees_factor(
-            fast, slow, gentle, 3
+        gentle = max(
+            SIGNS.gentle_rotation, SIGNS.gentle_over_noise * _mean_noise(slow_one)
         )
+        factor = _degrees_factor(
+            fast, slow, TURNS.least_rotation, 2
+        ) or _degrees_factor(fast, slow, gentle, 3)
         if factor:
             times = (
                 f"{figures(factor)} times the rotation of {shown(slow_one.topic.name)}"
@@ -109,7 +133,7 @@ def _degrees_factor(fast: Array, slow: Array, least: float, count: int) -> float
     """
     moving = (slow > least) & np.isfinite(fast + slow)
     factors = fast[moving] / slow[moving]
-    near = np.abs(factors / DEGREES.factor - 1.0) < NEAR
+    near = np.abs(factors / DEGREES.factor - 1.0) < SIGNS.near
     return float(np.median(factors)) if len(factors) >= count and near.all() else 0.0
 
 
@@ -127,8 +151,8 @@ def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
     # Values in deg/s stay below twice the range of the gyro.
     lasting = beyond & (largest < 2.0 * DEGREES.factor * largest_rate)
     each = report.segments.every * SEGMENT_LENGTH / REST_BLOCKS
-    often = beyond.mean() > FAST_SHARE
-    return bool(each * (beyond if often else lasting).sum() > FAST_TIME)
+    often = beyond.mean() > SIGNS.fast_share
+    return bool(each * (beyond if often else lasting).sum() > SIGNS.fast_time)
 
 
 def _swings_in_degrees(report: TopicReport) -> bool:
@@ -139,16 +163,16 @@ def _swings_in_degrees(report: TopicReport) -> bool:
     alike = [
         one
         for one in swings
-        if one.size > LEAST_SWING
-        and one.change < LARGEST_CHANGE * one.size**2
-        and one.shared > LEAST_SHARED
-        and abs(one.factor / DEGREES.factor - 1.0) < NEAR
+        if one.size > SWINGS.least_size
+        and one.change < SWINGS.largest_change * one.size**2
+        and one.shared > SWINGS.least_shared
+        and abs(one.factor / DEGREES.factor - 1.0) < SIGNS.near
     ]
-    if len(alike) < LEAST_SWUNG:
+    if len(alike) < SWINGS.least_windows:
         return False
     whole = sum_of(swings)
-    near = abs(whole.factor / DEGREES.factor - 1.0) < NEAR
-    return near and whole.shared > LEAST_SHARED
+    near = abs(whole.factor / DEGREES.factor - 1.0) < SIGNS.near
+    return near and whole.shared > SWINGS.least_shared
 
 
 class _Rest(NamedTuple):
@@ -189,10 +213,10 @@ def _no_gyros_at_rest(chosen: Sequence[TopicReport]) -> bool:
     """
     rests = [_rest_of(one) for one in chosen]
     for one in rests:
-        loud = one.noise > NOISIEST and np.abs(one.bias).max() > LARGEST_BIAS
-        if not loud or one.seconds < LEAST_REST:
+        loud = one.noise > SIGNS.noisiest and np.abs(one.bias).max() > LARGEST_BIAS
+        if not loud or one.seconds < SIGNS.least_rest:
             return False
-    if all(STILL < one.share < ALWAYS_STILL for one in rests):
+    if all(SIGNS.still < one.share < SIGNS.always_still for one in rests):
         return True
     apart = [
         float(np.linalg.norm(one.bias - other.bias))
@@ -211,4 +235,4 @@ def _are_mounted_alike(first: TopicReport, second: TopicReport) -> bool:
     size = min(map(len, means))
     one, other = (each[:size] - np.median(each[:size], axis=0) for each in means)
     power = float((one**2).sum() + (other**2).sum())
-    return float(((one - other) ** 2).sum()) < (1.0 - SHARED) * power
+    return float(((one - other) ** 2).sum()) < (1.0 - TURNS.shared) * power

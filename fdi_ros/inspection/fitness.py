@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,14 +42,24 @@ YEARS = 3.0 * YEAR
 DEFAULT_TIMEOUT = float(PARAMETERS["imus.timeout"].default)
 #: kinds of input, first those with stamps
 _PREFERRED = sorted(SOURCES.values(), key=lambda kind: not kind.stamped)
-#: largest share of messages recorded before the one ahead of them: a clock is set seldom
-MOST_DISORDERED = 0.1
-#: share of stamps that do not increase, from which on to look: not a message that came twice
-MANY_STAMPS = 0.01
-#: share of the values of a gyro that are repeated for long, from which on to look
-MUCH_FROZEN = 0.1
-#: the same, from which on most of what a unit sends measures nothing
-MOSTLY_FROZEN = 0.5
+
+
+class _DoubtfulShares(NamedTuple):
+    """Shares of what a unit sends from which on it is doubtful."""
+
+    #: largest share of messages recorded before the one ahead of them: a clock is
+    #: set seldom
+    disordered: float = 0.1
+    #: share of stamps that do not increase: not a message that came twice
+    stamps: float = 0.01
+    #: share of the values of a gyro that are repeated for long
+    frozen: float = 0.1
+    #: the same share from which on most of what a unit sends measures nothing
+    mostly_frozen: float = 0.5
+
+
+DOUBTFUL = _DoubtfulShares()
+
 NEEDED = ", or ".join(
     f"two {kind.type.rpartition('/')[2]} topics"
     if kind.stamped
@@ -228,7 +239,7 @@ def _unusable(report: TopicReport) -> str:
         == received,
         f"no message in which all values are finite and below {figures(BELIEVED)} rad/s": not report.complete,
         "its messages are not in the order of time: sort the file": report.disordered
-        > MOST_DISORDERED * received,
+        > DOUBTFUL.disordered * received,
         "a single message": received == 1,
         "its times of recording do not increase": not report.rate,
         f"it {report.copied}: {_NO_REDUNDANCY}": bool(report.copy_of),
@@ -355,7 +366,7 @@ def message_findings(
         words = f"the stamps of {listed(list(map(shown, names)))} go back by up to {size} s: a clock was set"
         yield _look("clock", words, Trouble.CLOCK, names, headline)
     for one in chosen:
-        if one.backward >= MANY_STAMPS * one.received:
+        if one.backward >= DOUBTFUL.stamps * one.received:
             words = (
                 f"{shown(one.topic.name)} repeats old stamps in"
                 f" {percent(one.backward / one.received)} of its messages: these are not used"
@@ -407,7 +418,7 @@ def bad_values(
 def _repeating(one: TopicReport) -> list[str]:
     """Return the channels that repeat one value in many messages, or the topic for all."""
     name = shown(one.topic.name)
-    much = one.repeats.count >= MUCH_FROZEN * one.received
+    much = one.repeats.count >= DOUBTFUL.frozen * one.received
     if much.all():
         return [name]
     return [f"{name} {place}" for place in np.array(one.places)[much].tolist()]
@@ -433,8 +444,8 @@ def frozen_words(chosen: Sequence[TopicReport]) -> str:
         shown(one.topic.name): float(one.repeats.count.min()) / one.received
         for one in chosen
     }
-    frozen = [name for name, share in shares.items() if share >= MOSTLY_FROZEN]
-    if not frozen or min(shares.values()) >= MUCH_FROZEN:
+    frozen = [name for name, share in shares.items() if share >= DOUBTFUL.mostly_frozen]
+    if not frozen or min(shares.values()) >= DOUBTFUL.frozen:
         return ""
     share = max(shares[name] for name in frozen)
     verb = "repeats" if len(frozen) == 1 else "repeat"

@@ -35,16 +35,25 @@ VIBRATION_RATIO = 2.0
 LARGEST_BIAS = 0.1
 #: segments kept; longer recordings keep every second one, then every fourth
 MOST_SEGMENTS = 4096
-#: values before, and after, one that may be a spike
-SPIKE_REACH = 2
-#: distance of a spike from the median of the values around it, over the usual second
-#: difference of the values in its segment
-SPIKE_RATIO = 12.0
-#: the same over the range of the values around it. In 34 recordings without known spikes
-#: two values of a channel at most are beyond both, and four are with 7 in place of 10.
-SPIKE_ISOLATION = 10.0
-#: share of the values of a segment from which on values far off are no spikes
-FREQUENT = 0.1
+
+
+class _SpikeSigns(NamedTuple):
+    """What shows that a value is a spike."""
+
+    #: values before a value, and after it, that it is compared with
+    reach: int = 2
+    #: distance from the median of the values around it, over the usual second
+    #: difference of the values in its segment
+    ratio: float = 12.0
+    #: distance over the range of the values around it. In 34 recordings without
+    #: known spikes two values of a channel at most are beyond both, and four are
+    #: with 7 in place of 10
+    isolation: float = 10.0
+    #: share of the values of a segment from which on values far off are no spikes
+    frequent: float = 0.1
+
+
+SPIKES = _SpikeSigns()
 
 
 class NoiseSegment(NamedTuple):
@@ -75,7 +84,7 @@ class NoiseSegments:
         # Values (K, c) that do not make a segment yet, and their times, ns.
         self._waiting = np.empty((0, channels))
         self._times = np.empty(0, dtype=np.int64)
-        # Last values (at most `SPIKE_REACH`, c) of the segment before, without spikes.
+        # Last values (at most `SPIKES.reach`, c) of the segment before, without spikes.
         self._before = np.empty((0, channels))
         # Spikes (c,) in all segments so far.
         self._spikes = np.zeros(channels, dtype=np.int64)
@@ -92,9 +101,9 @@ class NoiseSegments:
             if rate
             else len(values) + 1
         )
-        full = max(len(values) - SPIKE_REACH, 0) // size * size
+        full = max(len(values) - SPIKES.reach, 0) // size * size
         for k in range(0, full, size):
-            clean = self._without_spikes(values[k : k + size + SPIKE_REACH], size)
+            clean = self._without_spikes(values[k : k + size + SPIKES.reach], size)
             if self._passed % self.every == 0:
                 self._kept.append(_segment(clean, int(times[k])))
             self._passed += 1
@@ -110,7 +119,7 @@ class NoiseSegments:
         clean, spikes = without_spikes(np.vstack([self._before, values]))
         self._spikes += spikes.sum(axis=0)
         clean = clean[begin : begin + size]
-        self._before = clean[-SPIKE_REACH:]
+        self._before = clean[-SPIKES.reach :]
         return clean
 
     @property
@@ -210,13 +219,13 @@ def without_spikes(values: Array) -> tuple[Array, Mask]:
     """Replace the spikes in values (N, c) by the median of the values around them.
 
     Returns the values (N, c), and which were spikes. The first and last
-    `SPIKE_REACH` values are not examined.
+    `SPIKES.reach` values are not examined.
     """
     spikes = np.zeros(values.shape, dtype=bool)
-    if len(values) <= 2 * SPIKE_REACH:
+    if len(values) <= 2 * SPIKES.reach:
         return values, spikes
     around = np.delete(
-        sliding_window_view(values, 2 * SPIKE_REACH + 1, axis=0), SPIKE_REACH, axis=-1
+        sliding_window_view(values, 2 * SPIKES.reach + 1, axis=0), SPIKES.reach, axis=-1
     )
     median = np.median(around, axis=-1)
     change = np.abs(values[1:-1] - 0.5 * (values[2:] + values[:-2]))
@@ -224,12 +233,12 @@ def without_spikes(values: Array) -> tuple[Array, Mask]:
     # Coarse values at rest mostly repeat. Then one step of theirs is usual.
     least = np.where(step > 0.0, step, np.inf).min(axis=0)
     usual = np.maximum(np.median(change, axis=0), least)
-    bound = np.maximum(SPIKE_RATIO * usual, SPIKE_ISOLATION * np.ptp(around, axis=-1))
-    inside = spikes[SPIKE_REACH:-SPIKE_REACH]
-    inside[:] = np.abs(values[SPIKE_REACH:-SPIKE_REACH] - median) > bound
-    spikes &= spikes.mean(axis=0) < FREQUENT
+    bound = np.maximum(SPIKES.ratio * usual, SPIKES.isolation * np.ptp(around, axis=-1))
+    inside = spikes[SPIKES.reach : -SPIKES.reach]
+    inside[:] = np.abs(values[SPIKES.reach : -SPIKES.reach] - median) > bound
+    spikes &= spikes.mean(axis=0) < SPIKES.frequent
     clean = values.copy()
-    clean[SPIKE_REACH:-SPIKE_REACH][inside] = median[inside]
+    clean[SPIKES.reach : -SPIKES.reach][inside] = median[inside]
     return clean, spikes
 
 

@@ -35,19 +35,12 @@ from fdi_ros.inspection.fitness import (
 )
 from fdi_ros.inspection.topics import (
     BELIEVED,
-    GAP_INTERVALS,
+    INTERVALS,
     TopicReport,
     burst_words,
     inspect,
 )
-from fdi_ros.inspection.turns import (
-    LEAST_WINDOWS,
-    SHARED,
-    SQUARE,
-    TURN_WINDOW,
-    angle_of,
-    find_turn,
-)
+from fdi_ros.inspection.turns import TURNS, angle_of, find_turn
 from fdi_ros.inspection.urdf import Urdf
 from fdi_ros.model.samples import Array
 from fdi_ros.system.text import figures, listed, percent, shown
@@ -150,7 +143,7 @@ def turned_units(path: Path, config: Config) -> str:
     """Name the units that measure the motion of the first one along other axes, may be empty."""
     if not config.imus.topics:
         return ""
-    size = max(1, round(TURN_WINDOW * config.sample_rate))
+    size = max(1, round(TURNS.window * config.sample_rate))
     names = config.imus.names
     # Damaged rates may be anything: their means overflow, and are left out.
     with Recording(path) as recording, np.errstate(over="ignore", invalid="ignore"):
@@ -162,17 +155,17 @@ def turned_units(path: Path, config: Config) -> str:
         ]
     slow = np.concatenate([np.zeros((0, 3 * len(names))), *means])
     slow = slow[(np.abs(slow) < BELIEVED).all(axis=1)]
-    if len(slow) < LEAST_WINDOWS:
+    if len(slow) < TURNS.least_windows:
         return ""
     first, *others = np.split(slow - np.median(slow, axis=0), len(names), axis=1)
     turned = []
     for name, rate in zip(names[1:], others, strict=True):
         rotation = find_turn(first, rate)[0]
         # A fault stays, whatever the rotation.
-        explained = np.std(rate @ rotation.T - first) < (1.0 - SHARED) * np.std(
+        explained = np.std(rate @ rotation.T - first) < (1.0 - TURNS.shared) * np.std(
             rate - first
         )
-        if explained and angle_of(rotation) > SQUARE:
+        if explained and angle_of(rotation) > TURNS.square:
             turned.append(
                 f"{name} is turned by {math.degrees(angle_of(rotation)):.0f} deg against {names[0]}"
             )
@@ -221,7 +214,7 @@ def starting_config(
         known |= settings
     else:
         known |= _settings_of_array(chosen[0], urdf)
-    if silent := _longer(chosen, GAP_INTERVALS, 60.0):
+    if silent := _longer(chosen, INTERVALS.gap, 60.0):
         known["health.stale_timeout"] = silent, f"the default is {DEFAULT_TIMEOUT:g} s"
     return StartingConfig(
         shown(bag.name),

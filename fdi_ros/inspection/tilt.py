@@ -15,12 +15,20 @@ from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
 from fdi_ros.inspection.segments import NoiseSegments
 from fdi_ros.model.samples import Array
 
-#: segments of a window, in a row: long enough for a slow swing, short for a drift
-WINDOW_SEGMENTS = 8
-#: steps between segments, over the usual one, from which on there is a gap
-GAP_STEPS = 1.5
-#: specific force over the usual one, below which its direction is not known
-LEAST_FORCE = 0.1
+
+class _Windows(NamedTuple):
+    """Windows in which gravity may swing."""
+
+    #: segments of a window, in a row: long enough for a slow swing, short for a
+    #: drift
+    segments: int = 8
+    #: steps between segments, over the usual one, from which on there is a gap
+    gap: float = 1.5
+    #: specific force over the usual one, below which its direction is not known
+    least_force: float = 0.1
+
+
+WINDOWS = _Windows()
 
 
 class Swing(NamedTuple):
@@ -91,7 +99,7 @@ def _runs(rates: NoiseSegments, forces: NoiseSegments) -> list[list[_Pair]]:
         nearest = int(np.abs(begin - one.first).argmin())
         if abs(begin[nearest] - one.first) > BLOCK_TIME * 1e9:
             continue
-        if runs[-1] and one.first - runs[-1][-1].first > GAP_STEPS * usual:
+        if runs[-1] and one.first - runs[-1][-1].first > WINDOWS.gap * usual:
             runs.append([])
         runs[-1].append(_Pair(one.first, one.means, felt[nearest].means))
     return runs
@@ -100,8 +108,8 @@ def _runs(rates: NoiseSegments, forces: NoiseSegments) -> list[list[_Pair]]:
 def _windows(run: list[_Pair]) -> list[tuple[Array, Array, float]]:
     """Return rates (B, 3), specific forces (B, 3) and the step of blocks, s, by window."""
     parts = [
-        run[k : k + WINDOW_SEGMENTS]
-        for k in range(0, len(run) - WINDOW_SEGMENTS + 1, WINDOW_SEGMENTS)
+        run[k : k + WINDOWS.segments]
+        for k in range(0, len(run) - WINDOWS.segments + 1, WINDOWS.segments)
     ]
     return [
         (
@@ -116,7 +124,7 @@ def _windows(run: list[_Pair]) -> list[tuple[Array, Array, float]]:
 def _swing(rate: Array, force: Array, step: float) -> Swing:
     """Compare the swings of gravity in a window, without slow changes: biases and steady turns."""
     size = np.linalg.norm(force, axis=1)
-    if size.min() <= LEAST_FORCE * np.median(size):
+    if size.min() <= WINDOWS.least_force * np.median(size):
         return Swing(len(rate), 0.0, 0.0, 0.0)
     gravity = force / size[:, np.newaxis]
     between = 0.25 * np.cross(gravity[1:] + gravity[:-1], rate[1:] + rate[:-1])

@@ -36,14 +36,22 @@ from fdi_ros.report.layout import (
 from fdi_ros.system.files import RECORDING
 from fdi_ros.system.text import date_of, figures, listed, percent, shown
 
-#: intervals longer than this many usual ones are gaps
-GAP_INTERVALS = 3.0
-#: intervals by which the usual one is known
-SETTLED_STEPS = 100
-#: usual interval over the most frequent one: beyond, messages come in bursts
-BURST_RATIO = 2.0
-#: messages of a topic whose intervals are kept
-MOST_INTERVALS = 1_000_000
+
+class _Intervals(NamedTuple):
+    """How the intervals between messages of a topic are judged."""
+
+    #: intervals longer than this many usual ones are gaps
+    gap: float = 3.0
+    #: intervals by which the usual one is known
+    settled: int = 100
+    #: usual interval over the most frequent one: beyond, messages come in bursts
+    burst_ratio: float = 2.0
+    #: messages of a topic whose intervals are kept
+    most: int = 1_000_000
+
+
+INTERVALS = _Intervals()
+
 #: messages in a row in which copies are looked for
 RECENT_MESSAGES = 256
 #: larger values are damage, rad/s; their squares must not overflow
@@ -132,10 +140,10 @@ class TopicReport:
     def burst(self) -> int:
         """Usual number of stamps in a burst, 1 for single stamps."""
         steps = np.concatenate([np.empty(0), *self.stamp_steps])
-        if len(steps) < SETTLED_STEPS:
+        if len(steps) < INTERVALS.settled:
             return 1
         usual = usual_interval(steps)
-        if usual <= BURST_RATIO * float(np.median(steps)):
+        if usual <= INTERVALS.burst_ratio * float(np.median(steps)):
             return 1
         return max(2, round(len(steps) / max(1, int((steps > usual).sum()))))
 
@@ -271,10 +279,10 @@ def usual_interval(steps: Array) -> float:
     For single messages this is the median, for bursts the mean over longer runs.
     """
     median = float(np.median(steps))
-    run = min(SETTLED_STEPS // 2, len(steps))
+    run = min(INTERVALS.settled // 2, len(steps))
     ends = np.concatenate([[0.0], np.cumsum(steps)])
     mean = float(np.median(ends[run:] - ends[:-run])) / run
-    return mean if mean > BURST_RATIO * median else median
+    return mean if mean > INTERVALS.burst_ratio * median else median
 
 
 def _take_times(report: TopicReport, times: Int) -> None:
@@ -288,11 +296,11 @@ def _take_times(report: TopicReport, times: Int) -> None:
         return
     report.disordered += int((steps < 0.0).sum())
     report.longest = max(report.longest, float(steps.max()))
-    if report.received - len(times) < MOST_INTERVALS:
+    if report.received - len(times) < INTERVALS.most:
         report.intervals.append(steps)
     if report.interval > 0:
-        report.gaps += int((steps > GAP_INTERVALS * report.interval).sum())
-    elif report.received > SETTLED_STEPS:
+        report.gaps += int((steps > INTERVALS.gap * report.interval).sum())
+    elif report.received > INTERVALS.settled:
         _settle(report)
 
 
@@ -303,7 +311,7 @@ def _settle(report: TopicReport) -> None:
     steps = np.concatenate(report.intervals)
     report.interval = usual_interval(steps)
     if report.interval > 0:
-        report.gaps = int((steps > GAP_INTERVALS * report.interval).sum())
+        report.gaps = int((steps > INTERVALS.gap * report.interval).sum())
 
 
 def _take_frames(report: TopicReport, batch: Batch, rows: Int) -> None:
@@ -327,7 +335,7 @@ def _take_stamps(report: TopicReport, stamp: Int) -> None:
     steps = np.diff(np.concatenate([before, stamp])) * 1e-9
     report.backward += int((steps <= 0.0).sum())
     report.set_back = max(report.set_back, -float(steps.min(initial=0.0)))
-    if report.received <= MOST_INTERVALS:
+    if report.received <= INTERVALS.most:
         report.stamp_steps.append(steps)
     report.stamps = first, int(stamp[-1])
 

@@ -6,25 +6,35 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from fdi_ros.model.geometry import ROUNDING
 from fdi_ros.model.samples import Array
 
-#: root mean square rotation about any axis while in motion, rad/s: biases are mostly
-#: less
-LEAST_ROTATION = 0.05
-#: Windows in motion: with fewer, units are not compared, and no mount is estimated.
-LEAST_WINDOWS = 20
-#: Time over which rates are averaged before units are compared, s: turns by hand stay,
-#: noise goes.
-TURN_WINDOW = 0.25
-#: Share of the rotation that two units of one body have in common at least. Vibration
-#: and late stamps take the rest.
-SHARED = 0.7
-#: a mount this close to axes along axes is taken for that: the rest is misalignment
-SQUARE = np.radians(10.0)
+
+class TurnLimits(NamedTuple):
+    """Which turns show how units are mounted."""
+
+    #: root mean square rotation about any axis while in motion, rad/s: biases are
+    #: mostly less
+    least_rotation: float = 0.05
+    #: windows in motion: with fewer, units are not compared, and no mount is
+    #: estimated
+    least_windows: int = 20
+    #: time over which rates are averaged before units are compared, s: turns by
+    #: hand stay, noise goes
+    window: float = 0.25
+    #: share of the rotation that two units of one body have in common at least.
+    #: Vibration and late stamps take the rest
+    shared: float = 0.7
+    #: angle from axes along axes, rad, up to which a mount is taken for that: the
+    #: rest is misalignment
+    square: float = np.radians(10.0)
+
+
+TURNS = TurnLimits()
 
 
 def find_turn(first: Array, unit: Array) -> tuple[Array, Array, float]:

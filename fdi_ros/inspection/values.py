@@ -5,25 +5,34 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.model.quantity import RATE, Quantity
 from fdi_ros.model.samples import Array
 
-LEAST_RAIL = 4.0
-"""Smallest end of a range, rad/s. Gyros of 250 deg/s end at 4.36 rad/s."""
-LEAST_FORCE_RAIL = 19.0
-"""Smallest end of a range, m/s^2. Accelerometers of 2 g end at 19.6 m/s^2."""
-RAIL_RUN = 5
-"""Consecutive samples at the largest value that show the end of a range."""
+
+class _RangeSigns(NamedTuple):
+    """What shows the end of the range of a sensor."""
+
+    #: smallest end of a range, rad/s. Gyros of 250 deg/s end at 4.36 rad/s
+    least_rate: float = 4.0
+    #: smallest end of a range, m/s^2. Accelerometers of 2 g end at 19.6 m/s^2
+    least_force: float = 19.0
+    #: consecutive samples at the largest value
+    run: int = 5
+
+
+_RANGE = _RangeSigns()
 
 
 class Values:
     """Counts finite values and saturated samples of channels, block after block."""
 
     def __init__(self, n: int, quantity: Quantity = RATE) -> None:
-        least = LEAST_RAIL if quantity == RATE else LEAST_FORCE_RAIL
+        least = _RANGE.least_rate if quantity == RATE else _RANGE.least_force
         self._largest = np.full(n, least)
         self._run = np.zeros(n, dtype=np.int64)
         """(n,) consecutive samples at the largest value."""
@@ -57,9 +66,9 @@ class Values:
         edges = np.flatnonzero(np.diff(np.concatenate([[0], at_end, [0]])))
         for first, last in edges.reshape(-1, 2).tolist():
             run = last - first + (int(self._run[i]) if first == 0 else 0)
-            if run >= RAIL_RUN:
+            if run >= _RANGE.run:
                 counted = (
-                    run - (last - first) if run - (last - first) >= RAIL_RUN else 0
+                    run - (last - first) if run - (last - first) >= _RANGE.run else 0
                 )
                 self.saturated[i] += run - counted
             self._run[i] = run if last == len(size) else 0

@@ -22,15 +22,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.errors import DisagreementError
 from fdi_ros.estimator.shared_noise import UNEQUAL
-from fdi_ros.inspection.turns import (
-    LEAST_ROTATION,
-    LEAST_WINDOWS,
-    SHARED,
-    SQUARE,
-    TURN_WINDOW,
-    angle_of,
-    find_turn,
-)
+from fdi_ros.inspection.turns import TURNS, angle_of, find_turn
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.setup.blocks import Data
@@ -57,14 +49,14 @@ def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) 
     all if nothing decides.
     """
     means = data.slow_rates()
-    if len(means) < LEAST_WINDOWS:
+    if len(means) < TURNS.least_windows:
         return
     _check_units(means, nominal, unknown)
     rate = np.median(
         np.abs(means) / np.maximum(np.linalg.norm(nominal.axes, axis=1), 1e-9), axis=1
     )
-    moving = means[rate >= LEAST_ROTATION / 2]
-    if len(moving) >= LEAST_WINDOWS and not unknown:
+    moving = means[rate >= TURNS.least_rotation / 2]
+    if len(moving) >= TURNS.least_windows and not unknown:
         _check_response(moving, nominal)
 
 
@@ -93,7 +85,7 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
     known = [not {*unit} & {*unknown} for unit in turns.units]
     along_same_axes = [
         [
-            not (known[k] and known[j]) or _in_common(one, other) > SHARED
+            not (known[k] and known[j]) or _in_common(one, other) > TURNS.shared
             for j, other in enumerate(turns.rates)
         ]
         for k, one in enumerate(turns.rates)
@@ -124,8 +116,8 @@ def _turns_of(means: Array, nominal: Geometry) -> _Turns | None:
     if len(units) < 2:
         return None
     turning = np.array([np.linalg.norm(means[:, unit], axis=1) for unit in units])
-    moving = np.median(turning, axis=0) >= LEAST_ROTATION
-    if moving.sum() < LEAST_WINDOWS:
+    moving = np.median(turning, axis=0) >= TURNS.least_rotation
+    if moving.sum() < TURNS.least_windows:
         return None
     turning = np.maximum(turning[:, moving], 1e-9)
     means = means[moving]
@@ -269,7 +261,7 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
         seen = float(
             np.sqrt(np.maximum(gain @ square[np.ix_(three, three)] @ gain, 0.0))
         )
-        if seen < LEAST_ROTATION:
+        if seen < TURNS.least_rotation:
             return []
         response = float(gain @ square[three, i]) / seen**2
         small = abs(response) < LEAST_RESPONSE and size < LEAST_RESPONSE * seen
@@ -283,9 +275,9 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
 
 
 #: rotation about some axis, root mean square, below which nothing turns, rad/s
-LEAST_RATE = LEAST_ROTATION / 5
+LEAST_RATE = TURNS.least_rotation / 5
 #: Standard error beyond which axes along axes are an assumption, rad.
-LARGEST_DOUBT = SQUARE
+LARGEST_DOUBT = TURNS.square
 #: a mount less certain than this, in any direction, is not shown
 LARGEST_ERROR = np.radians(2.0)
 #: standard errors from which a delay or a mount off the axes is shown
@@ -334,9 +326,9 @@ def find_mounts(data: Data) -> tuple[Mount, ...]:
 
 def _against(first: Array, unit: Array) -> Mount:
     """Return the mount of a unit with rates (W, 3) against the first one (W, 3), rad/s."""
-    if len(unit) < LEAST_WINDOWS:
+    if len(unit) < TURNS.least_windows:
         return Mount(
-            f"NOT KNOWN: all units give values together for only {len(unit) * TURN_WINDOW:.0f} s"
+            f"NOT KNOWN: all units give values together for only {len(unit) * TURNS.window:.0f} s"
         )
     most, second = np.sqrt(
         np.maximum(np.linalg.eigvalsh(unit.T @ unit / len(unit)), 0.0)
@@ -376,7 +368,7 @@ def _against(first: Array, unit: Array) -> Mount:
     # Of all signed axes, a mirrored one is never the nearest.
     nearest = min(SIGNED_AXES, key=lambda axes: float(np.linalg.norm(axes - rotation)))
     off = angle_of(nearest.T @ rotation)
-    if off > max(SQUARE, SHOWN_ERRORS * doubt):
+    if off > max(TURNS.square, SHOWN_ERRORS * doubt):
         words = f"turned by {np.degrees(angle_of(rotation)):.1f} +- {np.degrees(error):.1f} deg"
         return Mount(words, shared, np.round(rotation, 6), 0.0, error)
     error = max(error, doubt)

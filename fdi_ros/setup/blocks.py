@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.estimator.estimator import BLOCK_TIME, REST_BLOCKS
 from fdi_ros.inspection.repeats import repeated
-from fdi_ros.inspection.turns import TURN_WINDOW
+from fdi_ros.inspection.turns import TURNS
 from fdi_ros.model.samples import Array, Block, Int, Mask
 from fdi_ros.setup.noise import projector
 
@@ -52,7 +52,7 @@ class Data:
 
     def slow_rates(self) -> Array:
         """Return rates (W, n) averaged over complete windows, less their medians."""
-        window = (self.stamp - self.stamp[0]) // round(TURN_WINDOW * 1e9)
+        window = (self.stamp - self.stamp[0]) // round(TURNS.window * 1e9)
         starts = np.flatnonzero(np.diff(window, prepend=-1))
         counts = np.diff(starts, append=len(window))
         # A window at the end, or beside a gap, may hold few samples.

@@ -26,7 +26,7 @@ from fdi_ros.errors import (
     DisagreementError,
     FdiError,
 )
-from fdi_ros.inspection.turns import LEAST_ROTATION, LEAST_WINDOWS
+from fdi_ros.inspection.turns import TURNS
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
 from fdi_ros.model.samples import Array, Block, Int, Mask
@@ -364,11 +364,11 @@ def _sensors(
     axes = nominal.axes.copy()
     scale = np.full(nominal.n, SCALE_STD)
     means = data.slow_rates()
-    if not source.units and len(means) >= LEAST_WINDOWS:
+    if not source.units and len(means) >= TURNS.least_windows:
         x = means[:, chosen]
         found = np.linalg.lstsq(x, means, rcond=None)[0].T @ axes[chosen]
         least = np.linalg.eigvalsh(x.T @ x / len(x))[0]
-        turns = np.sqrt(least) >= LEAST_ROTATION
+        turns = np.sqrt(least) >= TURNS.least_rotation
         if turns and np.abs(found - axes).max() > UNKNOWN_AXES:
             axes = found
             scale = np.full(nominal.n, UNKNOWN_AXES)

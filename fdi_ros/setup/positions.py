@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdi_ros.config.config import Config
-from fdi_ros.inspection.turns import SQUARE
+from fdi_ros.inspection.turns import TURNS
 from fdi_ros.model.quantity import FORCE
 from fdi_ros.model.samples import Array, Block, Int, Mask
 from fdi_ros.monitor.accelerometers import (
@@ -270,7 +270,7 @@ def _position(
         [
             np.full(3, BIAS_STD / FORCE.natural),
             np.full(3, POSITION_STD),
-            np.full(9, SQUARE),
+            np.full(9, TURNS.square),
             [UNIT_DELAY],
         ]
     )

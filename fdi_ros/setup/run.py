@@ -33,7 +33,7 @@ from fdi_ros.inspection.fitness import (
     refuse_unfit,
 )
 from fdi_ros.inspection.starting_config import starting_config
-from fdi_ros.inspection.topics import GAP_INTERVALS, TopicReport, inspect
+from fdi_ros.inspection.topics import INTERVALS, TopicReport, inspect
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.accelerometers import felt_units
 from fdi_ros.monitor.building import build_geometry
@@ -419,7 +419,7 @@ def _kept_from(block: Block) -> tuple[float, float] | None:
     if len(block) < 2:
         return None
     steps = np.diff(block.stamp) * 1e-9
-    lasts = np.cumsum(np.minimum(steps, GAP_INTERVALS * np.median(steps)))
+    lasts = np.cumsum(np.minimum(steps, INTERVALS.gap * np.median(steps)))
     kept = float(np.clip(KEPT_ASIDE * lasts[-1], LEAST_KEPT, MOST_KEPT))
     if lasts[-1] - kept < LEAST_LEFT:
         return None
