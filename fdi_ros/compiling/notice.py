@@ -14,7 +14,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 from numba.core import event
 
@@ -26,11 +26,23 @@ COMPILING = "compiling for the first use; later runs find the result"
 YOUNG_OBJECTS = 7000
 """Young objects that start a garbage collection while the compiler runs. Python's default is a tenth of this. The
 compiler makes millions of objects that last, and the default costs a seventh of its time."""
-FIRST_REPORT = 2.0
-"""Time from the notice to the first report of progress, s: by then some twenty functions are compiled."""
-NOTICE_PERIOD = 5.0  # s
-REPORTED_SHARE = 0.2
-"""Share of the functions from which on the time left is reported. The first ones are small and say little."""
+
+
+class _ProgressReports(NamedTuple):
+    """When progress of the compilation is reported."""
+
+    #: time from the notice to the first report, s: by then some twenty functions
+    #: are compiled
+    first: float = 2.0
+    #: time between two reports, s
+    period: float = 5.0
+    #: share of the functions from which on the time left is reported. The first
+    #: ones are small and say little
+    share: float = 0.2
+
+
+_REPORTS = _ProgressReports()
+
 _PASS = "numba:run_pass"
 """Event of Numba: a compiler pass.
 
@@ -133,10 +145,10 @@ def progress_logged(
     over = threading.Event()
 
     def report() -> None:
-        wait = FIRST_REPORT
+        wait = _REPORTS.first
         last = 0
         while not over.wait(wait):
-            wait = NOTICE_PERIOD
+            wait = _REPORTS.period
             left = (functions - done()) & missing()
             count = len(functions) - len(left)
             if count == last:
@@ -153,7 +165,7 @@ def progress_logged(
                 count,
                 len(functions),
                 f", about {spent / share - spent:.0f} s left"
-                if share >= REPORTED_SHARE
+                if share >= _REPORTS.share
                 else "",
             )
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -177,13 +177,19 @@ class Config:
 
     @property
     def unit_timeout(self) -> float:
-        """Time after which a unit is not waited for, s: ``imus.timeout``, and `LEAST_WAIT` samples at least."""
-        return max(self.imus.timeout, LEAST_WAIT / self.sample_rate)
+        """Time after which a unit is not waited for, s.
+
+        It is ``imus.timeout``, and `SAMPLES.least_wait` samples at least.
+        """
+        return max(self.imus.timeout, SAMPLES.least_wait / self.sample_rate)
 
     @property
     def stale_timeout(self) -> float:
-        """Time after which a silent channel is stale, s: ``health.stale_timeout``, `LEAST_WAIT` samples at least."""
-        return max(self.health.stale_timeout, LEAST_WAIT / self.sample_rate)
+        """Time after which a silent channel is stale, s.
+
+        It is ``health.stale_timeout``, and `SAMPLES.least_wait` samples at least.
+        """
+        return max(self.health.stale_timeout, SAMPLES.least_wait / self.sample_rate)
 
     @property
     def has_units(self) -> bool:
@@ -243,12 +249,20 @@ def check_lengths(config: Config, per: str, count: int) -> None:
             )
 
 
-#: samples: with fewer, a message that is late or lost looks like a silent unit
-LEAST_WAIT = 4
-#: samples that a bias is learned from at a start at rest
-MIN_LEARNED = 10
-#: samples over which the angular acceleration is taken at most
-MAX_SPAN = 1000
+class SampleLimits(NamedTuple):
+    """Limits of settings that are times, in samples."""
+
+    #: wait for a unit at least: with fewer, a message that is late or lost looks
+    #: like a silent unit
+    least_wait: int = 4
+    #: samples that a bias is learned from at a start at rest
+    min_learned: int = 10
+    #: samples over which the angular acceleration is taken at most
+    max_span: int = 1000
+
+
+SAMPLES = SampleLimits()
+
 _TOKEN = "[A-Za-z_{][A-Za-z0-9_{}]*"
 _TOPIC = re.compile(f"(?:/|~/)?{_TOKEN}(?:/{_TOKEN})*")
 
@@ -272,16 +286,16 @@ def _check_consistency(config: Config) -> None:
         )
     _check_accelerometers(config)
     learned = config.bias.startup_bias_duration * config.sample_rate
-    if 0 < learned < MIN_LEARNED:
+    if 0 < learned < SAMPLES.min_learned:
         raise ConfigError(
             f"bias.startup_bias_duration is {config.bias.startup_bias_duration:g} s, {learned:.1f} samples at"
-            f" {config.sample_rate:g} Hz, expected at least {MIN_LEARNED} samples"
+            f" {config.sample_rate:g} Hz, expected at least {SAMPLES.min_learned} samples"
         )
     span = config.noise.acceleration_window * config.sample_rate
-    if span > MAX_SPAN:
+    if span > SAMPLES.max_span:
         raise ConfigError(
             f"noise.acceleration_window is {config.noise.acceleration_window:g} s, {span:g} samples at"
-            f" {config.sample_rate:g} Hz, expected at most {MAX_SPAN} samples"
+            f" {config.sample_rate:g} Hz, expected at most {SAMPLES.max_span} samples"
         )
     if config.decision.confirm_alarms > config.decision.confirm_window:
         raise ConfigError(

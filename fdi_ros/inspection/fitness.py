@@ -14,7 +14,7 @@ import numpy as np
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.compiling.compiled import MAX_CHANNELS
-from fdi_ros.config.config import LEAST_WAIT, PARAMETERS, Config, is_plain_name
+from fdi_ros.config.config import PARAMETERS, SAMPLES, Config, is_plain_name
 from fdi_ros.core.sources import SOURCES
 from fdi_ros.errors import BagError
 from fdi_ros.inspection.degrees import in_degrees
@@ -30,7 +30,7 @@ from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.noise import much_noisier, noisier_words
 from fdi_ros.model.samples import LARGEST_GYRO_RANGE
 from fdi_ros.monitor.inputs import is_of_a_monitor
-from fdi_ros.monitor.soundness import LEAST_DELIVERED, LEAST_SPIKES, Trouble
+from fdi_ros.monitor.soundness import REPORTED, Trouble
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.system.text import LINE, figures, first_of, listed, percent, shown
 
@@ -162,7 +162,7 @@ def not_waited_for(reports: Sequence[TopicReport], timeout: float) -> str:
     ``timeout``: time for which a silent unit is waited for, s.
     """
     first = reports[0]
-    wait = max(timeout, LEAST_WAIT * max(one.interval for one in reports))
+    wait = max(timeout, SAMPLES.least_wait * max(one.interval for one in reports))
     words = [
         f"{shown(one.topic.name)} {_apart_words(one.ahead - first.ahead)}"
         for one in reports
@@ -378,7 +378,7 @@ def _slow_topics(chosen: Sequence[TopicReport]) -> Iterator[tuple[str, str]]:
     """Yield the topics that lack messages, compared with the best one, and how many."""
     times = [one.received * one.interval for one in chosen]
     for one, time in zip(chosen, times, strict=True):
-        if time < LEAST_DELIVERED * max(times):
+        if time < REPORTED.delivered * max(times):
             share = time / max(times)
             name = one.topic.name
             yield name, f"{shown(name)} delivered {percent(share)} of its messages"
@@ -425,13 +425,13 @@ def _repeating(one: TopicReport) -> list[str]:
 
 
 def _spike_words(one: TopicReport) -> list[str]:
-    """Return the number of spikes of each channel that has at least `LEAST_SPIKES`."""
+    """Return the number of spikes of each channel that has at least `REPORTED.spikes`."""
     halves = (("", one.segments.spikes), ("accelerometer ", one.forces.spikes))
     return [
         f"{count} in {half}{place}"
         for half, counts in halves
         for place, count in zip(one.places, counts.tolist(), strict=True)
-        if count >= LEAST_SPIKES
+        if count >= REPORTED.spikes
     ]
 
 

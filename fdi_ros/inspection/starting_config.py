@@ -16,12 +16,7 @@ import numpy as np
 
 from fdi_ros.bag.reader import Recording
 from fdi_ros.bag.samples import Samples
-from fdi_ros.config.config import (
-    MIN_LEARNED,
-    PARAMETERS,
-    Config,
-    parameter_file,
-)
+from fdi_ros.config.config import PARAMETERS, SAMPLES, Config, parameter_file
 from fdi_ros.config.unit_names import unit_names
 from fdi_ros.core.alignment import MAX_BRIDGE
 from fdi_ros.core.sources import input_of
@@ -234,7 +229,7 @@ def _settings_of_all(
     largest_rate = _rounded_up(
         float(np.fmax(max(PARAMETERS["health.max_rate"].default), 1.001 * largest))
     )
-    at_rest = rate * _REST >= MIN_LEARNED and all(map(_starts_at_rest, chosen))
+    at_rest = rate * _REST >= SAMPLES.min_learned and all(map(_starts_at_rest, chosen))
     return {
         "input": (input_name, ""),
         "sample_rate": (float(f"{rate:.4g}"), ""),

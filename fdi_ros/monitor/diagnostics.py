@@ -20,7 +20,7 @@ from fdi_ros.model.quantity import FORCE
 from fdi_ros.monitor.output import Topic
 from fdi_ros.monitor.soundness import (
     DECLARED,
-    MOST_CONCERNS,
+    REPORTED,
     Concern,
     Trouble,
     Word,
@@ -322,7 +322,7 @@ def _whole_message(
         "" if alike else status.note,
         *_format_units(status, worse),
         f"degraded: {', '.join(about)}" if about else "",
-        first_of(list(map(str, concerns)), MOST_CONCERNS, "; ") if concerns else "",
+        first_of(list(map(str, concerns)), REPORTED.concerns, "; ") if concerns else "",
     ]
     count = _healthy_words(status, healthy)
     note = "".join(f"; {one}" for one in words if one)

@@ -21,7 +21,7 @@ from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.monitor.diagnostics import input_warning
 from fdi_ros.monitor.soundness import (
-    LEAST_DELIVERED,
+    REPORTED,
     ChannelHealth,
     Concern,
     RateHealth,
@@ -38,16 +38,25 @@ if TYPE_CHECKING:
 
 SECOND = 1_000_000_000
 """One second, ns."""
-READINGS = 60
-"""Number of readings that are kept, one per second."""
-LEAST_READINGS = 10
-"""Smallest number of readings for a share, and number for the rate of a unit."""
-LEAST_RESIDUALS = 30
-"""Smallest number of residuals for a comparison of noise."""
+
+
+class _Readings(NamedTuple):
+    """Readings that the recent past consists of."""
+
+    #: number of readings that are kept, one per second
+    readings: int = 60
+    #: largest number of rates of a unit, from which its usual rate follows
+    rates: int = 600
+    #: smallest number of readings for a share, and number for the rate of a unit
+    least_readings: int = 10
+    #: smallest number of residuals for a comparison of noise
+    least_residuals: int = 30
+
+
+_KEPT = _Readings()
+
 USUAL_QUANTILE = 0.9
 """Quantile of the rates of a unit that is its usual rate, even if the unit is slow for long."""
-MOST_RATES = 600
-"""Largest number of rates of a unit, from which its usual rate follows."""
 
 _COUNTED_KINDS = (
     "samples",
@@ -80,8 +89,8 @@ class RecentHealth:
     """Health over the last minute, from a reading once a second."""
 
     def __init__(self) -> None:
-        self._readings: deque[_Reading] = deque(maxlen=READINGS)
-        self._rates: deque[Array] = deque(maxlen=MOST_RATES)
+        self._readings: deque[_Reading] = deque(maxlen=_KEPT.readings)
+        self._rates: deque[Array] = deque(maxlen=_KEPT.rates)
         self._concerns: list[Concern] = []
         self.channels: tuple[ChannelHealth, ...] = ()
         """Health of the channels in use that are not declared faulty, by the last reading."""
@@ -116,7 +125,7 @@ class RecentHealth:
         finite = samples - non_finite
         checked = last.checked - first.checked
         noise = self._own_noise(status)
-        measured = len(self._readings) >= LEAST_READINGS
+        measured = len(self._readings) >= _KEPT.least_readings
         unit_of = {name: unit.name for unit in status.units for name in unit.channels}
         for i, one in enumerate(status.channels):
             if one.is_left_out or one.state == ChannelState.AMBIGUOUS:
@@ -147,7 +156,7 @@ class RecentHealth:
 
     def _was_noisy(self, status: Status, channel: ChannelStatus) -> bool:
         """Whether the last spell of noise reaches into the time of the readings."""
-        return status.stamp - channel.last_noisy.until < READINGS * SECOND
+        return status.stamp - channel.last_noisy.until < _KEPT.readings * SECOND
 
     def _rate_health(self) -> RateHealth:
         """Return how long the fused rate was missing, to a second."""
@@ -164,7 +173,7 @@ class RecentHealth:
         A declared fault disturbs the fused rate, so that no comparison is possible.
         """
         residuals = np.array([one.residual for one in self._readings])
-        enough = np.isfinite(residuals).sum(axis=0) >= LEAST_RESIDUALS
+        enough = np.isfinite(residuals).sum(axis=0) >= _KEPT.least_residuals
         noise: list[float | None] = [None] * len(status.channels)
         if any(map(is_declared_or_silent, status.channels)) or not enough.any():
             return noise
@@ -180,7 +189,7 @@ class RecentHealth:
         self, status: Status, inputs: Sequence[InputStatus]
     ) -> Iterator[UnitHealth]:
         """Yield the health of each input topic, relative to its usual rate and to the other topics."""
-        rate = self._rate(LEAST_READINGS)
+        rate = self._rate(_KEPT.least_readings)
         if rate is None or not len(rate):
             for line in inputs:
                 yield UnitHealth(
@@ -191,9 +200,9 @@ class RecentHealth:
         usual = np.maximum(usual, 1e-9)
         # Messages that a busy computer lost are missing on all topics.
         best = float((rate / usual).max())
-        if best > 0.0 and (rate >= LEAST_DELIVERED * best * usual).all():
+        if best > 0.0 and (rate >= REPORTED.delivered * best * usual).all():
             self._rates.append(rate)
-        mean = self._rate(READINGS)
+        mean = self._rate(_KEPT.readings)
         mean = rate if mean is None else mean
         shares = mean / usual / max(float((mean / usual).max()), 1e-9)
         for line, share, own, normal in zip(inputs, shares, rate, usual, strict=True):
@@ -210,7 +219,7 @@ class RecentHealth:
     def _rate(self, readings: int) -> Array | None:
         """Return the rate of each topic over the last readings, Hz. None: too few readings."""
         last = self._readings[-1]
-        if len(self._readings) < LEAST_READINGS:
+        if len(self._readings) < _KEPT.least_readings:
             return None
         first = self._readings[-min(readings, len(self._readings))]
         rate: Array = (last.received - first.received) / (last.at - first.at)

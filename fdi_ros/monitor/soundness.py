@@ -28,37 +28,56 @@ if TYPE_CHECKING:
 
 DECLARED = (ChannelState.FAULTY, ChannelState.AMBIGUOUS)
 """States of a channel in a declared fault, named or in a set."""
-MOST_CONCERNS = 3
-"""Largest number of concerns in a verdict or in the line about the monitor."""
-LEAST_CHECKED = 0.5
-"""Share of its values that the others must have checked of a healthy channel."""
-LEAST_DELIVERED = 0.9
-"""Share of its messages that a healthy unit delivers."""
-LEAST_MISSING_S = 1.0
-"""Time without a fused rate that is reported, s. Shorter outages are in the notes."""
-LEAST_OF_CAUSE = 0.4
-"""Repeated values are the cause of unchecked samples from this share of them on."""
-LEAST_SATURATED_S = 1.0
-"""Time at the end of a range from which on it is the cause of unchecked samples, s."""
-LEAST_NOISY_S = 3.0
-"""Duration of noise that is reported, s."""
-LASTING_S = 1.5
-"""Noise that ended this short a time ago is taken to last, s."""
-LEAST_RESIDUAL = 1e-9
-"""Smallest residual that counts as measured, rad/s, as the smallest ``noise.noise_std``."""
-LEAST_VISIBLE_SHARE = 1e-3
-"""Smallest share of the errors of a channel that is taken to show in its residual."""
-LEAST_OF_VISIBLE = 0.25
-"""Smallest visible share of the errors of a channel, over the share with equal noise.
-So a noise below a third of all parallel channels counts as a third."""
-LEAST_DRIFT_RAD_S = 0.02
-"""Move of the bias of a gyro that is reported, rad/s. It is 1.4 mrad/s at most in 12 recordings
-without a known fault, up to 20 mrad/s where sensors warm up in simulation, and 30 mrad/s before a real crash."""
-MOSTLY = 0.7
-"""Share of the largest scale error from which on a channel is named with it: of two channels that
-differ, both have half of the difference."""
-LEAST_SPIKES = 3
-"""Spikes from which on they are reported. Fewer may be chance."""
+
+
+class Reported(NamedTuple):
+    """From where a finding about a flight is reported."""
+
+    #: largest number of concerns in a verdict or in the line about the monitor
+    concerns: int = 3
+    #: share of its values that the others must have checked of a healthy channel
+    checked: float = 0.5
+    #: share of its messages that a healthy unit delivers
+    delivered: float = 0.9
+    #: time without a fused rate, s. Shorter outages are in the notes
+    missing_s: float = 1.0
+    #: share of the unchecked samples from which on repeated values are their cause
+    cause: float = 0.4
+    #: time at the end of a range from which on it is the cause of unchecked
+    #: samples, s
+    saturated_s: float = 1.0
+    #: duration of noise, s
+    noisy_s: float = 3.0
+    #: noise that ended this short a time ago is taken to last, s
+    lasting_s: float = 1.5
+    #: move of the bias of a gyro, rad/s. It is 1.4 mrad/s at most in 12 recordings
+    #: without a known fault, up to 20 mrad/s where sensors warm up in simulation,
+    #: and 30 mrad/s before a real crash
+    drift_rad_s: float = 0.02
+    #: share of the largest scale error from which on a channel is named with it: of
+    #: two channels that differ, both have half of the difference
+    scale_share: float = 0.7
+    #: number of spikes. Fewer may be chance
+    spikes: int = 3
+
+
+REPORTED = Reported()
+
+
+class Visible(NamedTuple):
+    """How much of the errors of a channel shows in its residual."""
+
+    #: smallest residual that counts as measured, rad/s, as the smallest
+    #: ``noise.noise_std``
+    residual: float = 1e-9
+    #: smallest share of the errors that is taken to show
+    share: float = 1e-3
+    #: smallest visible share, over the share with equal noise: a noise below a
+    #: third of all parallel channels counts as a third
+    of_equal: float = 0.25
+
+
+VISIBLE = Visible()
 
 
 STAYED_OUT = "remained left out"
@@ -276,22 +295,22 @@ def own_noise(residual: Array, axes: Array) -> Array:
     own = axes[known]
     variance = np.ones(len(own))
     left = _left_by_fit(own, variance)
-    share = np.maximum(np.diag(left), LEAST_VISIBLE_SHARE)
-    least = LEAST_OF_VISIBLE * share
+    share = np.maximum(np.diag(left), VISIBLE.share)
+    least = VISIBLE.of_equal * share
     # It converges by more than a factor of two in each pass.
     for _ in range(20):
         square = np.einsum("ij,jk,ik->i", left, covariance, left)
-        variance = np.maximum(np.sqrt(variance * square / share), LEAST_RESIDUAL**2)
+        variance = np.maximum(np.sqrt(variance * square / share), VISIBLE.residual**2)
         left = _left_by_fit(own, variance)
-        share = np.maximum(np.diag(left), LEAST_VISIBLE_SHARE)
+        share = np.maximum(np.diag(left), VISIBLE.share)
         # Where others err alike, one channel would take all the weight and seem free of noise.
         factor = least / (1.0 - least) * (1.0 - share) / share
         if factor.max() > 1.0:
             variance *= np.maximum(factor, 1.0)
             left = _left_by_fit(own, variance)
-            share = np.maximum(np.diag(left), LEAST_VISIBLE_SHARE)
+            share = np.maximum(np.diag(left), VISIBLE.share)
     noise[known] = np.sqrt(variance)
-    noise[noise <= 2.0 * LEAST_RESIDUAL] = np.nan
+    noise[noise <= 2.0 * VISIBLE.residual] = np.nan
     return noise
 
 
@@ -330,13 +349,13 @@ def concerns_of(
         *_unchecked(channels),
         *left_out,
         *_unit_concerns(units),
-        *_incomplete([one for one in alone if one.delivered < LEAST_DELIVERED]),
+        *_incomplete([one for one in alone if one.delivered < REPORTED.delivered]),
         *_doubts([one for one in alone if one.doubt]),
         *_drifted([one for one in channels if _has_drifted(one)]),
         *_wrong_scale(channels),
         *_at_end_of_range([one for one in channels if one.saturated_s > 0.0]),
         *_rate_concerns(rate),
-        *_spiky([one for one in channels if one.spikes >= LEAST_SPIKES]),
+        *_spiky([one for one in channels if one.spikes >= REPORTED.spikes]),
         *_noise_concerns(channels),
     ]
 
@@ -393,9 +412,9 @@ def is_declared_or_silent(channel: ChannelStatus) -> bool:
 
 
 def _rate_concerns(rate: RateHealth | None) -> list[Concern]:
-    if rate is None or rate.missing_s < LEAST_MISSING_S:
+    if rate is None or rate.missing_s < REPORTED.missing_s:
         return []
-    word = Word.CANNOT_TELL if rate.share < LEAST_CHECKED else Word.LOOK
+    word = Word.CANNOT_TELL if rate.share < REPORTED.checked else Word.LOOK
     since = rate.missing_from_s
     when = "" if since is None else f", for the first time at {since:.1f} s"
     words = f"was not published for {figures(rate.missing_s)} s{when}"
@@ -403,7 +422,7 @@ def _rate_concerns(rate: RateHealth | None) -> list[Concern]:
 
 
 def _is_slow(unit: UnitHealth) -> bool:
-    return unit.delivered < LEAST_DELIVERED or unit.slow_from_s is not None
+    return unit.delivered < REPORTED.delivered or unit.slow_from_s is not None
 
 
 def _slow_words(unit: UnitHealth) -> str:
@@ -459,16 +478,16 @@ def why_unchecked(
 ) -> tuple[Trouble, tuple[str, ...]]:
     """Return what keeps channels from being checked, and the channels that cause it, if known."""
     most = max((1.0 - one.checked for one in channels), default=0.0)
-    if any(one.repeated >= LEAST_OF_CAUSE * most > 0.0 for one in channels):
+    if any(one.repeated >= REPORTED.cause * most > 0.0 for one in channels):
         return Trouble.UNCHECKED_REPEATS, ()
-    at_end = [one.name for one in channels if one.saturated_s >= LEAST_SATURATED_S]
+    at_end = [one.name for one in channels if one.saturated_s >= REPORTED.saturated_s]
     if at_end:
         return Trouble.END_OF_RANGE, tuple(at_end)
     return Trouble.UNCHECKED, ()
 
 
 def _unchecked(channels: Sequence[ChannelHealth]) -> list[Concern]:
-    some = [one for one in channels if one.checked < LEAST_CHECKED]
+    some = [one for one in channels if one.checked < REPORTED.checked]
     if not some:
         return []
     share = percent(min(one.checked for one in some))
@@ -487,7 +506,7 @@ def _incomplete(some: Sequence[ChannelHealth]) -> list[Concern]:
 
 
 def _has_drifted(one: ChannelHealth) -> bool:
-    return one.measured_in == "rad/s" and abs(one.drift) >= LEAST_DRIFT_RAD_S
+    return one.measured_in == "rad/s" and abs(one.drift) >= REPORTED.drift_rad_s
 
 
 def _drifted(some: Sequence[ChannelHealth]) -> list[Concern]:
@@ -504,7 +523,7 @@ def _wrong_scale(channels: Sequence[ChannelHealth]) -> list[Concern]:
     one of three reads 30 % too much, it is 20 % above the mean, and the others are 10 % below.
     """
     most = max((abs(one.scale) for one in channels), default=0.0)
-    odd = [one for one in channels if abs(one.scale) > MOSTLY * most]
+    odd = [one for one in channels if abs(one.scale) > REPORTED.scale_share * most]
     if not odd:
         return []
     low = min(one.scale for one in odd)
@@ -575,7 +594,7 @@ def _noise_concerns(channels: Sequence[ChannelHealth]) -> list[Concern]:
     brief = [
         one
         for one in channels
-        if one.noisy_s >= LEAST_NOISY_S and (one.unit or one.name) not in by_unit
+        if one.noisy_s >= REPORTED.noisy_s and (one.unit or one.name) not in by_unit
     ]
     return [*lasting, *_noisy_for_a_time(brief)]
 
@@ -584,7 +603,7 @@ def _lasting_noise_words(own: Sequence[ChannelHealth], ratio: float) -> str:
     """Describe the noise of channels of a unit, as it continues their names."""
     most = "up to " if len(own) > 1 else ""
     words = f"had {most}{figures(ratio, 2)} times the noise of the other units"
-    began = [one.noisy_from_s for one in own if one.noisy_s >= LEAST_NOISY_S]
+    began = [one.noisy_from_s for one in own if one.noisy_s >= REPORTED.noisy_s]
     if not began:
         return words
     since = f"from {min(began):.1f} s on"
@@ -607,7 +626,7 @@ def _noisy_for_a_time(channels: Sequence[ChannelHealth]) -> list[Concern]:
         when = f"from {began:.1f} s" if began >= 0.0 else f"{-began:.0f} s ago"
         times = figures(max(one.noisy_times for one in same), 2)
         words = f"had noise {times} times as large as usual for {first.noisy_s:.1f} s, {when}"
-        if began < 0.0 and -began - first.noisy_s < LASTING_S:
+        if began < 0.0 and -began - first.noisy_s < REPORTED.lasting_s:
             words = f"has noise {times} times as large as usual, for {-began:.0f} s now"
         names = tuple(one.name for one in channels if one in same)
         several = len({one.unit for one in same}) > 1

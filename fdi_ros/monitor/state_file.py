@@ -13,7 +13,7 @@ import re
 import stat
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,15 +31,29 @@ from fdi_ros.monitor.accelerometers import possible_units
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.system.files import DistrustError, open_regular, read_trusted, replacing
 
-STATE_FORMAT = 3
+
+class _StateFileRules(NamedTuple):
+    """When a state file is written, and which saved errors are believed."""
+
+    #: number of the format of the file
+    format: int = 3
+    #: largest file, bytes. Longer files are damaged
+    max_bytes: int = 1 << 20
+    #: expected standard deviations within which a saved error is believed, beside
+    #: its walk since
+    plausible: float = 5.0
+    #: standard deviations by which an error differs from its saved value, or times
+    #: by which it is known better, when it is saved again. A smaller change is
+    #: covered by the random walk that is added for the age of the file when it is
+    #: restored
+    change: float = 2.0
+    #: time until a failed save is tried again, s
+    retry: float = 1.0
+
+
+_FILE = _StateFileRules()
+
 FILE_BEGIN = re.compile(rb'\s*\{\s*"format"\s*:')  # what a state file begins with
-MAX_BYTES = 1 << 20  # largest state file, bytes. Longer files are damaged
-PLAUSIBLE = 5.0  # expected standard deviations within which a saved error is believed, beside its walk since
-SAVED_CHANGE = 2.0
-"""Errors are saved again once one differs from its saved value by this many
-standard deviations, or is known this many times better. A smaller change is covered by
-the random walk that is added for the age of the file when it is restored."""
-SAVE_RETRY = 1.0  # time until a failed save is tried again, s
 
 
 def configuration_hash(config: Config) -> str:
@@ -135,9 +149,9 @@ def _differs(state: dict[str, Any], kept: dict[str, Any] | None) -> bool:
     if now is None or then is None:
         return now is not then
     std, std_then = (np.sqrt(np.diag(errors["covariance"])) for errors in (now, then))
-    moved = np.abs(now["value"] - then["value"]) > SAVED_CHANGE * std
+    moved = np.abs(now["value"] - then["value"]) > _FILE.change * std
     return bool(
-        (moved | (std_then > SAVED_CHANGE * std)).any()
+        (moved | (std_then > _FILE.change * std)).any()
         or (now["late"] != then["late"]).any()
     )
 
@@ -253,7 +267,7 @@ def _check(
     turn_on_std = settings.turn_on_std
     prior = layout["prior"][:count].copy()
     prior[:n] = turn_on_std
-    limit = PLAUSIBLE * np.sqrt(prior**2 + np.diag(errors["covariance"]))
+    limit = _FILE.plausible * np.sqrt(prior**2 + np.diag(errors["covariance"]))
     delays = layout["delays"][1 : len(geometry.units)]
     # A state from before the first sample has only biases.
     limit[delays[delays < count]] = LONGEST_DELAY
@@ -263,7 +277,7 @@ def _check(
             f"error state {worst + 1} is {value[worst]:.3g}, expected within {limit[worst]:.3g}"
         )
     common = float(np.abs(geometry.least_squares @ (bias + value[:n])).max())
-    most = PLAUSIBLE * turn_on_std
+    most = _FILE.plausible * turn_on_std
     if common > most:
         raise RefusalError(
             f"its biases pass for a turn of {common:.3g} rad/s, expected within {most:.3g}"
@@ -350,7 +364,7 @@ class StateFile:
         self.is_rejected = True
         try:
             self._restore_from(
-                json.loads(read_trusted(self.path, MAX_BYTES).decode()), pipeline
+                json.loads(read_trusted(self.path, _FILE.max_bytes).decode()), pipeline
             )
         except FileNotFoundError:
             self.is_rejected = False
@@ -396,7 +410,7 @@ class StateFile:
         if not _differs(state, self._kept) or time.monotonic() < self._not_before:
             return False
         about = {
-            "format": STATE_FORMAT,
+            "format": _FILE.format,
             "configuration": configuration_hash(pipeline.config),
             "saved": time.time(),
         }
@@ -412,7 +426,7 @@ class StateFile:
         except OSError as error:
             self.words = f"state cannot be saved to {self.path}: {error.strerror}"
             self.failed = True
-            self._not_before = time.monotonic() + SAVE_RETRY
+            self._not_before = time.monotonic() + _FILE.retry
         else:
             self._kept = state
             self.failed = False
@@ -420,8 +434,8 @@ class StateFile:
         return True
 
     def _restore_from(self, saved: Any, pipeline: Pipeline) -> None:
-        if saved["format"] != STATE_FORMAT:
-            raise RefusalError(f"format {saved['format']!r}, expected {STATE_FORMAT}")
+        if saved["format"] != _FILE.format:
+            raise RefusalError(f"format {saved['format']!r}, expected {_FILE.format}")
         if saved["configuration"] != configuration_hash(pipeline.config):
             raise RefusalError("it was saved with another configuration")
         age = time.time() - float(saved["saved"])

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,13 +41,24 @@ CERTAIN_SIGMAS = 4.0
 """Standard deviations from which a measured delay, difference or trend is certain: by chance 1 in 16 000."""
 LOST_STATES = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
 SCALE_PARTS = ("scale x", "scale y", "scale z")  # kinds of `ErrorStatus`
-LEAST_SCALE_ERROR = 0.04
-"""Scale error against the others that is reported, a share. In 20 recordings of healthy vehicles
-it is 0.013 at most; data sheets of consumer IMUs allow 0.03."""
-CERTAIN = 2.0  # standard deviations by which it is beyond that
-UNUSUAL = 3.0  # expected standard deviations from which an error is unusual
 
-MAX_START_BIAS = 4.0  # a start bias of more bias.turn_on_std is reported: one healthy start in 16 000
+
+class ErrorLimits(NamedTuple):
+    """Which estimated errors are unusual."""
+
+    #: scale error against the others, a share. In 20 recordings of healthy vehicles
+    #: it is 0.013 at most; data sheets of consumer IMUs allow 0.03
+    scale: float = 0.04
+    #: standard deviations by which a scale error is beyond that
+    beyond: float = 2.0
+    #: expected standard deviations from which an estimated error is unusual
+    sigmas: float = 3.0
+    #: start bias, a multiple of ``bias.turn_on_std``: one healthy start in 16 000
+    #: has more
+    start_bias: float = 4.0
+
+
+UNUSUAL_ERRORS = ErrorLimits()
 
 
 @dataclass(frozen=True)
@@ -185,8 +196,8 @@ class ErrorStatus:
     def is_unusual(self) -> bool:
         """Whether the error is certainly larger than expected."""
         return (
-            abs(self.value) > UNUSUAL * self.prior
-            and abs(self.value) - UNUSUAL * self.prior > 2.0 * self.std
+            abs(self.value) > UNUSUAL_ERRORS.sigmas * self.prior
+            and abs(self.value) - UNUSUAL_ERRORS.sigmas * self.prior > 2.0 * self.std
         )
 
     def __str__(self) -> str:
@@ -280,7 +291,7 @@ class Status:
     def certain_scale_error(self, channel: ChannelStatus) -> float:
         """Return how much more a channel reads than the rate or force along its axis, as a share.
 
-        0 if that is not certain to `CERTAIN` standard deviations beyond `LEAST_SCALE_ERROR`.
+        0 unless it exceeds `UNUSUAL_ERRORS.scale` by `UNUSUAL_ERRORS.beyond` standard deviations.
         """
         parts = [
             (error.value, error.std)
@@ -295,7 +306,8 @@ class Status:
         std = math.hypot(
             *(a * std for a, (_, std) in zip(channel.axis, parts, strict=True))
         )
-        return value if abs(value) > LEAST_SCALE_ERROR + CERTAIN * std else 0.0
+        least = UNUSUAL_ERRORS.scale + UNUSUAL_ERRORS.beyond * std
+        return value if abs(value) > least else 0.0
 
     def turn_on_std(self, channel: ChannelStatus) -> float:
         """Return the standard deviation of a bias from one start to the next, in the channel's unit."""
@@ -305,7 +317,7 @@ class Status:
 
     def has_implausible_start_bias(self, channel: ChannelStatus) -> bool:
         """Whether a channel is used that began with a bias no healthy sensor is expected to have."""
-        limit = MAX_START_BIAS * self.turn_on_std(channel)
+        limit = UNUSUAL_ERRORS.start_bias * self.turn_on_std(channel)
         return not channel.is_left_out and abs(channel.start_bias) > limit > 0.0
 
 

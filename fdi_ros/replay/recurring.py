@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from fdi_ros.monitor.soundness import LEAST_NOISY_S
+from fdi_ros.monitor.soundness import REPORTED
 from fdi_ros.replay.episodes import (
     MOST_STEPS,
     Episode,
@@ -116,7 +116,7 @@ def _noise_after(
         time
         for time in noisy
         if time.measured_in == one.measured_in
-        and time.until_s - time.since_s >= LEAST_NOISY_S
+        and time.until_s - time.since_s >= REPORTED.noisy_s
         and one.start_s <= time.since_s <= one.end_s + RECURS_WITHIN
     ]
     by_unit: dict[str, list[NoisyTime]] = {}

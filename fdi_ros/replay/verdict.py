@@ -13,7 +13,7 @@ from collections.abc import Collection, Sequence
 
 from fdi_ros.core.states import Reason
 from fdi_ros.monitor.soundness import (
-    MOST_CONCERNS,
+    REPORTED,
     Concern,
     Trouble,
     Word,
@@ -72,7 +72,7 @@ def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
     if word is Word.HEALTHY:
         sentence = _healthy_words(judgement)
     else:
-        listed_ones = first_of(list(map(str, deciding)), MOST_CONCERNS, "; ")
+        listed_ones = first_of(list(map(str, deciding)), REPORTED.concerns, "; ")
         sentence = f"no fault was found in {seconds:.1f} s, but {listed_ones}."
         sentence += f" What to do: {advice_on(deciding)}"
     return ReplayVerdict(word.value, f"{word.value}: {sentence}.", tuple(names))
@@ -225,12 +225,12 @@ def _faulty_sentences(
         sentences.append(f"First seen at {first.start_s:.1f} s.")
     lasting = _without_brief_sets(faulty)
     heat = [words for one in lasting if (words := warming_words(one, unit))]
-    sentences += heat[:MOST_CONCERNS]
+    sentences += heat[: REPORTED.concerns]
     others = dict.fromkeys(one.who for one in lasting[1:] if one.who != first.who)
     if others:
         sentences.append(f"Also {_other_names(list(others))}.")
     sentences += [one.sentence for one in set_clocks(judgement)]
-    noise = [f"{one}." for one in noise_behind(judgement)[:MOST_CONCERNS]]
+    noise = [f"{one}." for one in noise_behind(judgement)[: REPORTED.concerns]]
     if not noise and first.noisy_from_s is not None:
         begins = f"From {first.noisy_from_s:.1f} s on"
         noise = [f"{begins} the whole unit is noisy, as a loose one is."]

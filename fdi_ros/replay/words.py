@@ -14,7 +14,7 @@ from fdi_ros.faults.fault import ACCELEROMETERS
 from fdi_ros.faults.kinds import FAULT_KINDS
 from fdi_ros.monitor.diagnostics import UNUSED_COUNTERS
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
-from fdi_ros.monitor.soundness import MOST_CONCERNS, Concern, Trouble, UnitHealth, Word
+from fdi_ros.monitor.soundness import REPORTED, Concern, Trouble, UnitHealth, Word
 from fdi_ros.replay.episodes import (
     MOST_TOLD,
     Episode,
@@ -76,8 +76,8 @@ def _concern_lines(summary: Summary) -> list[str]:
     word = verdict_of(summary).word
     deciding = [one for one in summary.concerns if one.word.value == word]
     said = [
-        *deciding[:MOST_CONCERNS],
-        *noise_behind(summary)[:MOST_CONCERNS],
+        *deciding[: REPORTED.concerns],
+        *noise_behind(summary)[: REPORTED.concerns],
         *([] if summary.scores.faults else set_clocks(summary)),
     ]
     others = [one for one in _beside_silence(summary) if one not in said]

@@ -32,7 +32,7 @@ from fdi_ros.inspection.fitness import (
 from fdi_ros.inspection.topics import topic_columns
 from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array
-from fdi_ros.monitor.soundness import LEAST_DRIFT_RAD_S, Trouble
+from fdi_ros.monitor.soundness import REPORTED, Trouble
 from fdi_ros.replay.sweep_report import declared_figures
 from fdi_ros.replay.verdict import LEAST_JUDGED
 from fdi_ros.report.layout import (
@@ -449,7 +449,7 @@ def _warnings(result: Calibration, unit: Unit) -> Iterator[Finding]:
             Role.WARNING, "noise", words, who, float(noise[worst]), None, beside
         )
     swing = np.ptp(found.curve, axis=0)
-    if far := [names[i] for i in np.flatnonzero(swing >= LEAST_DRIFT_RAD_S)]:
+    if far := [names[i] for i in np.flatnonzero(swing >= REPORTED.drift_rad_s)]:
         most = f"{swing.max() * unit.factor:.2g} {unit.name}"
         words = f"the bias of {listed(far)} moved by up to {most} within the recording"
         advice = Trouble.DRIFT.advice(far)

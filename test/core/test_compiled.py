@@ -401,8 +401,8 @@ def test_progress_of_compiling_is_logged_only_where_it_grew(said, monkeypatch):
             asked.set()
         return set("abcd"[: 2 if count is None else count])
 
-    monkeypatch.setattr(notice, "FIRST_REPORT", 0.0)
-    monkeypatch.setattr(notice, "NOTICE_PERIOD", 0.0)
+    soon = notice._REPORTS._replace(first=0.0, period=0.0)
+    monkeypatch.setattr(notice, "_REPORTS", soon)
     monkeypatch.setattr(notice, "missing", lambda: set("abcd"))
     with notice.progress_logged(set("abcd"), done, needs_all=False):
         asked.wait()

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from fdi_ros.monitor.soundness import LEAST_NOISY_S
+from fdi_ros.monitor.soundness import REPORTED
 from fdi_ros.replay.episodes import (
     Episode,
     Evidence,
@@ -186,7 +186,7 @@ def test_noise_tells_which_unit_of_a_set_is_loose():
         (episode(6.0), noise("imu_3.x", "imu_3.y", "imu_2.x")),
         (episode(6.0), noise("imu_3.x", "imu_3.y", since=8.5)),
         (episode(6.0), noise("imu_3.x", "imu_3.y", since=2.0)),
-        (episode(6.0), noise("imu_3.x", "imu_3.y", until=6.9 + LEAST_NOISY_S)),
+        (episode(6.0), noise("imu_3.x", "imu_3.y", until=6.9 + REPORTED.noisy_s)),
         (episode(6.0), noise(*FORCES, half="m/s^2")),
         (episode(6.0, state="FAULTY"), noise("imu_3.x", "imu_3.y")),
     ],
