@@ -49,7 +49,7 @@ class _DegreeSigns(NamedTuple):
     gentle_over_noise: float = 10.0
 
 
-SIGNS = _DegreeSigns()
+DEGREE_SIGNS = _DegreeSigns()
 
 #: of the rates of a unit, that are compared with those of another
 QUANTILES = (
@@ -98,7 +98,8 @@ def in_degrees(
         zip(chosen, rates, strict=True), repeat=2
     ):
         gentle = max(
-            SIGNS.gentle_rotation, SIGNS.gentle_over_noise * _mean_noise(slow_one)
+            DEGREE_SIGNS.gentle_rotation,
+            DEGREE_SIGNS.gentle_over_noise * _mean_noise(slow_one),
         )
         factor = _degrees_factor(
             fast, slow, TURNS.least_rotation, 2
@@ -133,7 +134,7 @@ def _degrees_factor(fast: Array, slow: Array, least: float, count: int) -> float
     """
     moving = (slow > least) & np.isfinite(fast + slow)
     factors = fast[moving] / slow[moving]
-    near = np.abs(factors / DEGREES.factor - 1.0) < SIGNS.near
+    near = np.abs(factors / DEGREES.factor - 1.0) < DEGREE_SIGNS.near
     return float(np.median(factors)) if len(factors) >= count and near.all() else 0.0
 
 
@@ -151,8 +152,8 @@ def _is_beyond(report: TopicReport, largest_rate: float) -> bool:
     # Values in deg/s stay below twice the range of the gyro.
     lasting = beyond & (largest < 2.0 * DEGREES.factor * largest_rate)
     each = report.segments.every * SEGMENT_LENGTH / REST_BLOCKS
-    often = beyond.mean() > SIGNS.fast_share
-    return bool(each * (beyond if often else lasting).sum() > SIGNS.fast_time)
+    often = beyond.mean() > DEGREE_SIGNS.fast_share
+    return bool(each * (beyond if often else lasting).sum() > DEGREE_SIGNS.fast_time)
 
 
 def _swings_in_degrees(report: TopicReport) -> bool:
@@ -166,12 +167,12 @@ def _swings_in_degrees(report: TopicReport) -> bool:
         if one.size > SWINGS.least_size
         and one.change < SWINGS.largest_change * one.size**2
         and one.shared > SWINGS.least_shared
-        and abs(one.factor / DEGREES.factor - 1.0) < SIGNS.near
+        and abs(one.factor / DEGREES.factor - 1.0) < DEGREE_SIGNS.near
     ]
     if len(alike) < SWINGS.least_windows:
         return False
     whole = sum_of(swings)
-    near = abs(whole.factor / DEGREES.factor - 1.0) < SIGNS.near
+    near = abs(whole.factor / DEGREES.factor - 1.0) < DEGREE_SIGNS.near
     return near and whole.shared > SWINGS.least_shared
 
 
@@ -213,10 +214,12 @@ def _no_gyros_at_rest(chosen: Sequence[TopicReport]) -> bool:
     """
     rests = [_rest_of(one) for one in chosen]
     for one in rests:
-        loud = one.noise > SIGNS.noisiest and np.abs(one.bias).max() > LARGEST_BIAS
-        if not loud or one.seconds < SIGNS.least_rest:
+        loud = (
+            one.noise > DEGREE_SIGNS.noisiest and np.abs(one.bias).max() > LARGEST_BIAS
+        )
+        if not loud or one.seconds < DEGREE_SIGNS.least_rest:
             return False
-    if all(SIGNS.still < one.share < SIGNS.always_still for one in rests):
+    if all(DEGREE_SIGNS.still < one.share < DEGREE_SIGNS.always_still for one in rests):
         return True
     apart = [
         float(np.linalg.norm(one.bias - other.bias))

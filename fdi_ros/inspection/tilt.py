@@ -16,7 +16,7 @@ from fdi_ros.inspection.segments import NoiseSegments
 from fdi_ros.model.samples import Array
 
 
-class _Windows(NamedTuple):
+class _SwingWindows(NamedTuple):
     """Windows in which gravity may swing."""
 
     #: segments of a window, in a row: long enough for a slow swing, short for a
@@ -28,7 +28,7 @@ class _Windows(NamedTuple):
     least_force: float = 0.1
 
 
-WINDOWS = _Windows()
+SWING_WINDOWS = _SwingWindows()
 
 
 class Swing(NamedTuple):
@@ -99,7 +99,7 @@ def _runs(rates: NoiseSegments, forces: NoiseSegments) -> list[list[_Pair]]:
         nearest = int(np.abs(begin - one.first).argmin())
         if abs(begin[nearest] - one.first) > BLOCK_TIME * 1e9:
             continue
-        if runs[-1] and one.first - runs[-1][-1].first > WINDOWS.gap * usual:
+        if runs[-1] and one.first - runs[-1][-1].first > SWING_WINDOWS.gap * usual:
             runs.append([])
         runs[-1].append(_Pair(one.first, one.means, felt[nearest].means))
     return runs
@@ -108,8 +108,8 @@ def _runs(rates: NoiseSegments, forces: NoiseSegments) -> list[list[_Pair]]:
 def _windows(run: list[_Pair]) -> list[tuple[Array, Array, float]]:
     """Return rates (B, 3), specific forces (B, 3) and the step of blocks, s, by window."""
     parts = [
-        run[k : k + WINDOWS.segments]
-        for k in range(0, len(run) - WINDOWS.segments + 1, WINDOWS.segments)
+        run[k : k + SWING_WINDOWS.segments]
+        for k in range(0, len(run) - SWING_WINDOWS.segments + 1, SWING_WINDOWS.segments)
     ]
     return [
         (
@@ -124,7 +124,7 @@ def _windows(run: list[_Pair]) -> list[tuple[Array, Array, float]]:
 def _swing(rate: Array, force: Array, step: float) -> Swing:
     """Compare the swings of gravity in a window, without slow changes: biases and steady turns."""
     size = np.linalg.norm(force, axis=1)
-    if size.min() <= WINDOWS.least_force * np.median(size):
+    if size.min() <= SWING_WINDOWS.least_force * np.median(size):
         return Swing(len(rate), 0.0, 0.0, 0.0)
     gravity = force / size[:, np.newaxis]
     between = 0.25 * np.cross(gravity[1:] + gravity[:-1], rate[1:] + rate[:-1])

@@ -53,7 +53,7 @@ class _Readings(NamedTuple):
     least_residuals: int = 30
 
 
-_KEPT = _Readings()
+_PAST = _Readings()
 
 USUAL_QUANTILE = 0.9
 """Quantile of the rates of a unit that is its usual rate, even if the unit is slow for long."""
@@ -89,8 +89,8 @@ class RecentHealth:
     """Health over the last minute, from a reading once a second."""
 
     def __init__(self) -> None:
-        self._readings: deque[_Reading] = deque(maxlen=_KEPT.readings)
-        self._rates: deque[Array] = deque(maxlen=_KEPT.rates)
+        self._readings: deque[_Reading] = deque(maxlen=_PAST.readings)
+        self._rates: deque[Array] = deque(maxlen=_PAST.rates)
         self._concerns: list[Concern] = []
         self.channels: tuple[ChannelHealth, ...] = ()
         """Health of the channels in use that are not declared faulty, by the last reading."""
@@ -125,7 +125,7 @@ class RecentHealth:
         finite = samples - non_finite
         checked = last.checked - first.checked
         noise = self._own_noise(status)
-        measured = len(self._readings) >= _KEPT.least_readings
+        measured = len(self._readings) >= _PAST.least_readings
         unit_of = {name: unit.name for unit in status.units for name in unit.channels}
         for i, one in enumerate(status.channels):
             if one.is_left_out or one.state == ChannelState.AMBIGUOUS:
@@ -156,7 +156,7 @@ class RecentHealth:
 
     def _was_noisy(self, status: Status, channel: ChannelStatus) -> bool:
         """Whether the last spell of noise reaches into the time of the readings."""
-        return status.stamp - channel.last_noisy.until < _KEPT.readings * SECOND
+        return status.stamp - channel.last_noisy.until < _PAST.readings * SECOND
 
     def _rate_health(self) -> RateHealth:
         """Return how long the fused rate was missing, to a second."""
@@ -173,7 +173,7 @@ class RecentHealth:
         A declared fault disturbs the fused rate, so that no comparison is possible.
         """
         residuals = np.array([one.residual for one in self._readings])
-        enough = np.isfinite(residuals).sum(axis=0) >= _KEPT.least_residuals
+        enough = np.isfinite(residuals).sum(axis=0) >= _PAST.least_residuals
         noise: list[float | None] = [None] * len(status.channels)
         if any(map(is_declared_or_silent, status.channels)) or not enough.any():
             return noise
@@ -189,7 +189,7 @@ class RecentHealth:
         self, status: Status, inputs: Sequence[InputStatus]
     ) -> Iterator[UnitHealth]:
         """Yield the health of each input topic, relative to its usual rate and to the other topics."""
-        rate = self._rate(_KEPT.least_readings)
+        rate = self._rate(_PAST.least_readings)
         if rate is None or not len(rate):
             for line in inputs:
                 yield UnitHealth(
@@ -202,7 +202,7 @@ class RecentHealth:
         best = float((rate / usual).max())
         if best > 0.0 and (rate >= REPORTED.delivered * best * usual).all():
             self._rates.append(rate)
-        mean = self._rate(_KEPT.readings)
+        mean = self._rate(_PAST.readings)
         mean = rate if mean is None else mean
         shares = mean / usual / max(float((mean / usual).max()), 1e-9)
         for line, share, own, normal in zip(inputs, shares, rate, usual, strict=True):
@@ -219,7 +219,7 @@ class RecentHealth:
     def _rate(self, readings: int) -> Array | None:
         """Return the rate of each topic over the last readings, Hz. None: too few readings."""
         last = self._readings[-1]
-        if len(self._readings) < _KEPT.least_readings:
+        if len(self._readings) < _PAST.least_readings:
             return None
         first = self._readings[-min(readings, len(self._readings))]
         rate: Array = (last.received - first.received) / (last.at - first.at)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from fdi_ros.errors import ConfigError
-from fdi_ros.replay.episodes import MOST_TOLD, episode_words
+from fdi_ros.replay.episodes import ROOM, episode_words
 from fdi_ros.replay.outcomes import Outcome
 from fdi_ros.replay.summary import Judgement
 from fdi_ros.replay.verdict import LEAST_JUDGED
@@ -149,13 +149,13 @@ def _measure(name: str, judgement: Judgement) -> tuple[float, str]:
         )
     if name == "declared":
         count = len(story.declared) + story.more
-        listed = [episode_words(one) for one in story.declared[:MOST_TOLD]]
+        listed = [episode_words(one) for one in story.declared[: ROOM.episodes]]
         what = f"episode{'s' if count != 1 else ''}"
     else:
         count = len(scores.declared)
         listed = [
             f"{one.channel} {one.state} at {one.at_s:.3f} s"
-            for one in scores.declared[:MOST_TOLD]
+            for one in scores.declared[: ROOM.episodes]
         ]
         what = "declarations" + (
             " without an injected fault that explains them" if scores.faults else ""

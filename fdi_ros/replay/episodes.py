@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +22,32 @@ from fdi_ros.replay.warming import Warming
 from fdi_ros.report.layout import FORCES, RADIANS, Unit
 from fdi_ros.system.text import figures, listed, percent, plus_minus
 
-STRETCH_GAP = 10.0
-"""Gap between two stretches, s. A shorter hole is within a stretch: messages were lost."""
-LONGEST_HOLE_S = 1.0
-"""Longest time without samples over which faults are injected and curves are drawn, s."""
+
+class EpisodeTimes(NamedTuple):
+    """Times that cut a stream into stretches and episodes, s."""
+
+    #: gap between two stretches. A shorter hole is within a stretch: messages were
+    #: lost
+    stretch_gap: float = 10.0
+    #: longest time without samples over which faults are injected and curves are
+    #: drawn
+    longest_hole: float = 1.0
+    #: a fault that stands for less is reported with its duration
+    brief: float = 1.0
+    #: largest time between the first signs of a fault of a unit in its gyros and in
+    #: its accelerometers
+    across_halves: float = 5.0
+    #: time between the first sign and the declaration that is reported. Words have
+    #: tenths
+    least_before: float = 0.05
 
 
-def pieces(stamp: NDArray[np.int64], longest: float = LONGEST_HOLE_S) -> list[slice]:
+EPISODE_TIMES = EpisodeTimes()
+
+
+def pieces(
+    stamp: NDArray[np.int64], longest: float = EPISODE_TIMES.longest_hole
+) -> list[slice]:
     """Cut stamps (N,), ns, at intervals longer than ``longest``, s. Return slices of rows."""
     edges = [
         0,
@@ -38,13 +57,19 @@ def pieces(stamp: NDArray[np.int64], longest: float = LONGEST_HOLE_S) -> list[sl
     return [slice(begin, end) for begin, end in pairwise(edges) if end > begin]
 
 
-BRIEF = 1.0
-"""A fault that stands for less is reported with its duration, s."""
-ACROSS_HALVES = 5.0
-"""Largest time between the first signs of a fault of a unit in its gyros and in its
-accelerometers, s."""
-MOST_STEPS = 20
-"""Largest number of steps of an episode. The last step is always kept."""
+class EpisodeRoom(NamedTuple):
+    """How many episodes, steps and channels are described."""
+
+    #: largest number of steps of an episode. The last step is always kept
+    steps: int = 20
+    #: episodes in the summary. The tables have all
+    episodes: int = 5
+    #: largest set that is described channel by channel
+    channels: int = 3
+
+
+ROOM = EpisodeRoom()
+
 DECLARED = ("FAULTY", "AMBIGUOUS")
 """States of an episode with a declared fault. The other state, STALE, means no data."""
 Course = Literal[
@@ -202,13 +227,17 @@ class Episode:
 
     @property
     def is_brief(self) -> bool:
-        """Whether it is a set that ended within `BRIEF`, or sets that all did."""
+        """Whether it is a set that ended within `EPISODE_TIMES.brief`, or sets that all did."""
         if self.halves:
             return all(half.is_brief for half in self.halves)
         if self.longest_s is not None:
-            return self.longest_s < BRIEF
+            return self.longest_s < EPISODE_TIMES.brief
         length = self.end_s - self.since_s
-        return self.state == "AMBIGUOUS" and not self.stands and length < BRIEF
+        return (
+            self.state == "AMBIGUOUS"
+            and not self.stands
+            and length < EPISODE_TIMES.brief
+        )
 
     @property
     def ever(self) -> frozenset[str]:
@@ -309,7 +338,7 @@ def _is_of_unit(
     return (
         {unit_of[name] for name in one.channels} == units
         and (one.stretch, one.declares) == (first.stretch, first.declares)
-        and one.start_s <= min(first.end_s, first.start_s + ACROSS_HALVES)
+        and one.start_s <= min(first.end_s, first.start_s + EPISODE_TIMES.across_halves)
     )
 
 
@@ -349,14 +378,8 @@ def _whole(parts: Sequence[Episode], units: Sequence[str]) -> Episode:
 
 HALVES = {RADIANS.name: "gyros", FORCES.name: "accelerometers"}
 """Kinds of sensors of a unit, by the unit of their figures."""
-MOST_TOLD = 5
-"""Episodes in the summary. The tables have all."""
 TOO_SMALL = "too small to measure"
 """Words for a size below its standard error."""
-LEAST_BEFORE = 0.05
-"""Time between the first sign and the declaration that is told, s. Words have tenths."""
-FEW_CHANNELS = 3
-"""Largest set that is described channel by channel."""
 
 
 def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
@@ -443,7 +466,7 @@ def episode_words(one: Episode, unit: Unit = RADIANS) -> str:
         until += f", noisy from {one.noisy_from_s:.3f} s on"
     about = _about(one, unit)
     before = _before(one)
-    if not before and one.since_s - one.start_s >= LEAST_BEFORE:
+    if not before and one.since_s - one.start_s >= EPISODE_TIMES.least_before:
         before = f"suspected from {one.start_s:.3f} s"
     if one.apart is not None:
         where = (
@@ -536,7 +559,7 @@ def _about(one: Episode, unit: Unit) -> str:
             )
             if part
         )
-    if len(one.channels) <= FEW_CHANNELS:
+    if len(one.channels) <= ROOM.channels:
         return "; ".join(f"if it is {name}: {words}" for name, words in sizes)
     known = [
         abs(candidate.size.rad_s)
@@ -559,7 +582,7 @@ def _before(one: Episode) -> str:
     earlier = [step for step in one.steps[:-1] if step.channels != one.channels]
     chosen = earlier[:1]
     for step in earlier[1:][-1:]:
-        if len(step.channels) <= 1 + FEW_CHANNELS and step.who != chosen[0].who:
+        if len(step.channels) <= 1 + ROOM.channels and step.who != chosen[0].who:
             chosen.append(step)
     return ", ".join(f"{step.who} from {step.at_s:.3f} s" for step in chosen)
 
@@ -592,12 +615,12 @@ def detail_words(
     ]
     if one.declares:
         axes = dict.fromkeys(candidate.axis for candidate in one.candidates)
-        if 0 < len(axes) <= FEW_CHANNELS:
+        if 0 < len(axes) <= ROOM.channels:
             lines.append(("axis", f"{', '.join(axes)} of the body"))
         growing = [
             words for candidate in one.candidates if (words := _growth(candidate, unit))
         ]
-        if growing and len(one.channels) <= FEW_CHANNELS:
+        if growing and len(one.channels) <= ROOM.channels:
             lines.append(("size", "; ".join(growing)))
         lines.append(("evidence", _evidence(one)))
         if rivals := _rivals(one):
@@ -652,7 +675,7 @@ def _rivals(one: Episode) -> str:
             if len(one.channels) == 1
             else "no single channel explains the evidence"
         )
-    if len(one.channels) > FEW_CHANNELS:
+    if len(one.channels) > ROOM.channels:
         return f"an error of any of {', '.join(one.channels)}"
     return ""
 

@@ -22,28 +22,45 @@ from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.recent import USUAL_QUANTILE
 from fdi_ros.monitor.soundness import UnitHealth, own_noise
 
-MOST_WINDOWS = 4096
-"""Windows in which messages are counted. For longer recordings their length doubles."""
-FIRST_WINDOW = 1.0
-"""Length of a window at first, s."""
-MESSAGES_IN_WINDOW = 20.0
-"""Smallest mean number of messages in a window for a rate."""
-USUAL_SHARE = 0.9
-"""Share of the usual count from which on a window counts for the usual rate."""
-SLOW_SHARE = 0.6
-"""Share of the usual count below which a unit is slow."""
-LEAST_SLOW = 3
-"""Windows in a row that a unit is slow at least."""
-INTERVAL_BINS = 400
-"""Bins for the intervals between messages, enough for 10 us to 1.3 hours."""
-SHORTEST_INTERVAL = 1e-5
-"""Lower edge of the first bin, s."""
-BIN_RATIO = 1.05
-"""Upper over lower edge of a bin. Three bins together are 15 % wide."""
-STEADY_SHARE = 0.5
-"""Share of the intervals in the bin of their median and beside it, from which on messages
-have a usual interval. With losses at random it is the share of the messages that arrive;
-arrival times without order have a tenth there, and no usual interval."""
+
+class _Windows(NamedTuple):
+    """Windows in which messages are counted, and the rates that they show."""
+
+    #: number of windows. For longer recordings their length doubles
+    most: int = 4096
+    #: length of a window at first, s
+    first: float = 1.0
+    #: smallest mean number of messages in a window for a rate
+    messages: float = 20.0
+    #: share of the usual count from which on a window counts for the usual rate
+    usual: float = 0.9
+    #: share of the usual count below which a unit is slow
+    slow: float = 0.6
+    #: windows in a row that a unit is slow at least
+    least_slow: int = 3
+
+
+WINDOWS = _Windows()
+
+
+class _Bins(NamedTuple):
+    """Bins for the intervals between messages: 10 us to 1.3 hours."""
+
+    #: number of bins
+    number: int = 400
+    #: lower edge of the first bin, s
+    shortest: float = 1e-5
+    #: upper over lower edge of a bin. Three bins together are 15 % wide
+    ratio: float = 1.05
+    #: share of the intervals in the bin of their median and beside it, from which
+    #: on messages have a usual interval. With losses at random it is the share of
+    #: the messages that arrive; arrival times without order have a tenth there, and
+    #: no usual interval
+    steady: float = 0.5
+
+
+BINS = _Bins()
+
 
 NOISE_WINDOW = 3.0
 """Duration of a window in which noise is measured, s: some swings of a loose mount."""
@@ -59,7 +76,7 @@ class Delivery(NamedTuple):
     rate: float | None
     """Usual messages per second, Hz. None: too few messages."""
     slow_from: float | None = None
-    """Start of the longest time at less than `SLOW_SHARE` of its rate, s. None: no such time."""
+    """Start of the longest time at less than `WINDOWS.slow` of its rate, s. None: no such time."""
     slow_to: float | None = None
     """End of that time, s. None: it lasts to the end, or there is no such time."""
     slow_rate: float | None = None
@@ -71,18 +88,18 @@ class Deliveries:
 
     def __init__(self, topics: int, start: float = 0.0) -> None:
         """``start``: time of the first message that is counted, s."""
-        self._counts = np.zeros((topics, MOST_WINDOWS), dtype=np.int64)
+        self._counts = np.zeros((topics, WINDOWS.most), dtype=np.int64)
         self._start = start
-        self._width = FIRST_WINDOW
+        self._width = WINDOWS.first
         self._first: int | None = None
         """Time of recording of the first message, ns."""
         self._last = 0
         """Latest time of recording, ns."""
         self._newest = np.full(topics, -1, dtype=np.int64)
         """Time of recording of the last message of each topic, ns. -1: none."""
-        self._intervals = np.zeros((topics, INTERVAL_BINS), dtype=np.int64)
+        self._intervals = np.zeros((topics, BINS.number), dtype=np.int64)
         """Number of intervals between messages by their length."""
-        self._lengths = np.zeros((topics, INTERVAL_BINS))
+        self._lengths = np.zeros((topics, BINS.number))
         """Their sums, s."""
 
     def tap(self, batch: Batch, rows: Int) -> None:
@@ -94,7 +111,7 @@ class Deliveries:
             self._first = int(times[0])
         self._last = max(self._last, int(times.max()))
         since = np.maximum(times - self._first, 0) * 1e-9
-        while since.max() >= MOST_WINDOWS * self._width:
+        while since.max() >= WINDOWS.most * self._width:
             halved = self._counts.reshape(len(self._counts), -1, 2).sum(axis=2)
             self._counts = np.hstack([halved, np.zeros_like(halved)])
             self._width *= 2
@@ -108,8 +125,8 @@ class Deliveries:
         """Take the times of recording of further messages of topic k, ns."""
         steps = steps_of(self._newest, k, times) * 1e-9
         steps = steps[steps > 0.0]
-        bins = np.log(steps / SHORTEST_INTERVAL) / np.log(BIN_RATIO)
-        bins = np.clip(bins, 0, INTERVAL_BINS - 1).astype(np.intp)
+        bins = np.log(steps / BINS.shortest) / np.log(BINS.ratio)
+        bins = np.clip(bins, 0, BINS.number - 1).astype(np.intp)
         np.add.at(self._intervals[k], bins, 1)
         np.add.at(self._lengths[k], bins, steps)
 
@@ -123,7 +140,7 @@ class Deliveries:
         middle = int(np.searchsorted(counts.cumsum(), 0.5 * counts.sum()))
         near = slice(max(middle - 1, 0), middle + 2)
         alike = int(counts[near].sum())
-        if alike < max(STEADY_SHARE * counts.sum(), MESSAGES_IN_WINDOW):
+        if alike < max(BINS.steady * counts.sum(), WINDOWS.messages):
             return 0.0
         return float(alike / self._lengths[k, near].sum())
 
@@ -136,17 +153,17 @@ class Deliveries:
         counts = self._counts[:, :length].astype(np.float64)
         # Mean number of messages of each topic, in windows with messages.
         usual_count = counts.sum(axis=1) / np.maximum((counts > 0).sum(axis=1), 1)
-        fewest = usual_count[usual_count > 0].min(initial=MESSAGES_IN_WINDOW)
+        fewest = usual_count[usual_count > 0].min(initial=WINDOWS.messages)
         together = 1
         while (
-            length // together > 2 * LEAST_SLOW
-            and fewest * together < MESSAGES_IN_WINDOW
+            length // together > 2 * WINDOWS.least_slow
+            and fewest * together < WINDOWS.messages
         ):
             together *= 2
         width = self._width * together
         counts = counts[:, : length // together * together]
         counts = counts.reshape(len(counts), -1, together).sum(axis=2)
-        if counts.shape[1] < 2 * LEAST_SLOW:
+        if counts.shape[1] < 2 * WINDOWS.least_slow:
             return [Delivery(1.0, None) for _ in counts]
         steady: Array = np.array(list(map(self._steady_rate, range(len(counts)))))
         most = np.quantile(counts, USUAL_QUANTILE, axis=1)
@@ -157,7 +174,7 @@ class Deliveries:
         shares = shares[:, recorded > 0] / np.maximum(recorded[recorded > 0], 1e-9)
         times: Array = np.asarray(self._start + width * np.flatnonzero(recorded > 0))
         # The quantile is a little more than the mean of the windows of a usual rate.
-        full = counts >= USUAL_SHARE * usual[:, None]
+        full = counts >= WINDOWS.usual * usual[:, None]
         rates = (counts * full).sum(axis=1) / np.maximum(full.sum(axis=1), 1) / width
         rates = np.maximum(rates, steady)
         return [
@@ -181,11 +198,11 @@ def _delivery(shares: Array, times: Array, width: float, rate: float) -> Deliver
     if not len(shares):
         return Delivery(1.0, None)
     share = float(shares.mean())
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], shares < SLOW_SHARE, [0]])))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], shares < WINDOWS.slow, [0]])))
     runs = edges.reshape(-1, 2)
     longest = max(runs.tolist(), key=lambda run: run[1] - run[0], default=[0, 0])
     first, last = longest
-    if last - first < LEAST_SLOW:
+    if last - first < WINDOWS.least_slow:
         return Delivery(share, rate)
     slow_to = None if last == len(shares) else float(times[last - 1] + width)
     slow_rate = rate * float(shares[first:last].mean())

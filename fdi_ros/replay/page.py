@@ -23,7 +23,7 @@ from fdi_ros.monitor.building import GUARD, build_geometry, build_noise
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import (
-    LONGEST_HOLE_S,
+    EPISODE_TIMES,
     Episode,
     Story,
     detail_words,
@@ -66,12 +66,27 @@ LOG_FROM = 10.0
 """Ratio of statistic to threshold from which on the scale is logarithmic."""
 _AXES = "xyz"
 _INK = "var(--text)"
-MOST_PAGE_ROWS = 1000
-"""Largest number of rows in the table of events."""
-MOST_CARDS = 200
-"""Largest number of episodes on the page. The JSON file has all."""
-SHOWN_AROUND = 2.0
-"""Least time that the link of an episode shows before and after the episode, s."""
+
+
+class _PageRoom(NamedTuple):
+    """What a page of a replay has room for."""
+
+    #: largest number of rows in a table
+    rows: int = 1000
+    #: largest number of episodes. The JSON file has all
+    cards: int = 200
+    #: largest number of changes of state in the plot
+    changes: int = 2000
+    #: largest number of marked declarations
+    marks: int = 200
+    #: least time that the link of an episode shows before and after the episode, s
+    around: float = 2.0
+    #: time after the begin and the detection of a fault that the scale of residuals
+    #: covers, s
+    in_view: float = 1.0
+
+
+PAGE = _PageRoom()
 
 
 class Words(NamedTuple):
@@ -342,7 +357,7 @@ class Report(Sink):
             curves.alone.add(time, half)
         # Curves also break at holes within a stretch.
         holes = np.flatnonzero(
-            np.diff(time, prepend=self._last or time[0]) > LONGEST_HOLE_S
+            np.diff(time, prepend=self._last or time[0]) > EPISODE_TIMES.longest_hole
         )
         for k, part in enumerate(np.split(np.arange(len(time)), holes)):
             if k:
@@ -573,17 +588,17 @@ def _episode_section(
         return Section(
             "What happened", "", ["Nothing was declared, and no channel fell silent."]
         )
-    more = max(0, len(story.episodes) - MOST_CARDS) + story.more
+    more = max(0, len(story.episodes) - PAGE.cards) + story.more
     hint = (
         "From the first declaration on. Size: how far the channel is from what the others give, +- its standard"
         f" error.{f' {more} more are left out.' if more else ''}"
     )
-    cards = (_card(one, scored, unit, origin) for one in story.episodes[:MOST_CARDS])
+    cards = (_card(one, scored, unit, origin) for one in story.episodes[: PAGE.cards])
     return Section("What happened", hint, f'<div class="cards">{"".join(cards)}</div>')
 
 
 def _card(one: Episode, scored: bool, unit: Unit, origin: int | None) -> str:
-    room = max(SHOWN_AROUND, 0.2 * one.duration_s)
+    room = max(PAGE.around, 0.2 * one.duration_s)
     low = max(0.0, one.start_s - room)
     high = one.end_s + room
     link = f'<a href="#t={low:.3f},{high:.3f}">show it</a>'
@@ -613,15 +628,15 @@ def _event_section(events: Sequence[StateChange], unit: Unit) -> Section:
         ),
     }
     more = (
-        f" {len(events) - MOST_PAGE_ROWS} more are left out."
-        if len(events) > MOST_PAGE_ROWS
+        f" {len(events) - PAGE.rows} more are left out."
+        if len(events) > PAGE.rows
         else ""
     )
     hint = f"The history: what it came to stands above.{more}"
     return Section(
         "Changes of state",
         hint,
-        head_and_rows(columns, events[:MOST_PAGE_ROWS]) if events else [],
+        head_and_rows(columns, events[: PAGE.rows]) if events else [],
     )
 
 
@@ -733,12 +748,6 @@ def _share_axes(layouts: Sequence[dict[str, Any]], name: str) -> None:
 # States and marks over time
 
 
-MOST_CHANGES = 2000
-"""Largest number of changes of state in the plot."""
-MOST_MARKS = 200
-"""Largest number of marked declarations."""
-IN_VIEW = 1.0
-"""Time after the begin and the detection of a fault that the scale of residuals covers, s."""
 STATE_STYLES = {
     "OK": ("#8fbf9f", ""),
     "SUSPECT": ("#e6c84f", "slashes"),
@@ -783,7 +792,7 @@ def _timeline(
             )
 
     changes = [event for event in scores.events if event.before != event.state]
-    for event in changes[:MOST_CHANGES]:
+    for event in changes[: PAGE.changes]:
         close(event.channel, event.at_s)
         current[event.channel] = (event.state, event.at_s, event.reason)
     for name in names:
@@ -829,7 +838,7 @@ def _in_view(
         if time is not None
     ]
     times += [one.since_s for one in episodes if one.declares]
-    return [[time, time + IN_VIEW] for time in times[:MOST_MARKS]]
+    return [[time, time + PAGE.in_view] for time in times[: PAGE.marks]]
 
 
 def _marks(
@@ -845,7 +854,7 @@ def _marks(
             found.append((at, kind, f"{fault.kind} on {fault.channel}: {kind}", ""))
     why = ", no injected fault explains it" if faults else ""
     for one in [one for one in episodes if one.declares and not one.injected][
-        :MOST_MARKS
+        : PAGE.marks
     ]:
         found.append(
             (one.start_s, "declared", f"{one.steps[0].who} {one.steps[0].state}", why)
@@ -869,7 +878,7 @@ def _autopilot_marks(summary: Summary) -> list[dict[str, Any]]:
             "text": f"autopilot at {one.at_s:.3f} s: {one.text}",
         }
         | ({"label": f"autopilot: {one.text}"} if one.kind == "ERR" else {})
-        for one in summary.autopilot[:MOST_MARKS]
+        for one in summary.autopilot[: PAGE.marks]
     ]
 
 
@@ -884,7 +893,7 @@ def _autopilot_section(said: Sequence[AutopilotText]) -> list[Section]:
             Section(
                 "What the autopilot said",
                 "",
-                head_and_rows(columns, said[:MOST_PAGE_ROWS]),
+                head_and_rows(columns, said[: PAGE.rows]),
             )
         ]
         if said

@@ -18,6 +18,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +38,8 @@ from fdi_ros.model.samples import Array
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.status import CERTAIN_SIGMAS
 from fdi_ros.replay.episodes import (
-    LONGEST_HOLE_S,
-    MOST_STEPS,
+    EPISODE_TIMES,
+    ROOM,
     Apart,
     Candidate,
     Course,
@@ -65,19 +66,29 @@ _DECLARED, _EPISODE_STATES, _HIDING = (
 
 #: Episodes with details. Further ones are only counted.
 MOST_EPISODES = 1000
-UNIT_SILENCE = 0.5
-"""Channels of a unit that fall silent within this time, s, belong to one episode."""
-SILENCE_AFTER_HOLE = 0.5
-"""Silence shorter than `LONGEST_HOLE_S` that begins within this time after a hole, s, belongs to the
-hole."""
+
+
+class _Holes(NamedTuple):
+    """Holes in a stream, and the silence of units beside them."""
+
+    #: smallest hole, s
+    least: float = 0.1
+    #: smallest hole, as a multiple of the interval before
+    intervals: float = 5.0
+    #: channels of a unit that fall silent within this time, s, belong to one
+    #: episode
+    of_unit: float = 0.5
+    #: silence shorter than `EPISODE_TIMES.longest_hole` that begins within this
+    #: time after a hole, s, belongs to the hole
+    after: float = 0.5
+
+
+_HOLES = _Holes()
+
 RATE_BEFORE = 0.5
 """The rate before an episode is the one at this time before its start, s."""
 _DIAGONAL = [0, 3, 5]
 """Indices of the diagonal in the upper triangle of a symmetric 3 x 3 matrix."""
-LEAST_HOLE = 0.1
-"""Smallest hole in a stream, s."""
-HOLE_INTERVALS = 5.0
-"""Smallest hole in a stream, as a multiple of the interval before."""
 
 
 @dataclass
@@ -255,7 +266,9 @@ class Recorder:
         judged = np.isfinite(output.threshold)
         steps = np.diff(np.concatenate([[part.end_s], time]))
         watched = (
-            judged & (steps <= LONGEST_HOLE_S) & ~np.isin(before, _DECLARED).any(axis=1)
+            judged
+            & (steps <= EPISODE_TIMES.longest_hole)
+            & ~np.isin(before, _DECLARED).any(axis=1)
         )
         self._part = Stretch(
             part.start_s,
@@ -316,7 +329,7 @@ class Recorder:
             silent = [
                 one for one in self._open if one.kind == S.STALE and one.members <= unit
             ]
-            if lately := [one for one in silent if at - one.start <= UNIT_SILENCE]:
+            if lately := [one for one in silent if at - one.start <= _HOLES.of_unit]:
                 self._step(lately[0], lately[0].members | group, lately[0].since)
             else:
                 self._begin(S.STALE, group, at, reason_of(group), std)
@@ -334,7 +347,7 @@ class Recorder:
         self._interval = (
             float(steps[-1]) if len(time) > 1 or self._part is not None else np.inf
         )
-        return time[(steps > LEAST_HOLE) & (steps > HOLE_INTERVALS * usual)]
+        return time[(steps > _HOLES.least) & (steps > _HOLES.intervals * usual)]
 
     def _row_before(self, at: float) -> int:
         """Return the row of the tail shortly before a time, s, or the first row."""
@@ -355,7 +368,7 @@ class Recorder:
                 at,
                 reason,
                 std,
-                at - self._resumed <= SILENCE_AFTER_HOLE,
+                at - self._resumed <= _HOLES.after,
             )
         )
         self._step(self._open[-1], members, at)
@@ -372,7 +385,7 @@ class Recorder:
             who = all_of_words(self._geometry, channels)
         step = Step(round(at, 9), one.kind.name, names, who)
         if one.steps and (
-            one.steps[-1].at_s == step.at_s or len(one.steps) >= MOST_STEPS
+            one.steps[-1].at_s == step.at_s or len(one.steps) >= ROOM.steps
         ):
             one.steps.pop()
         one.steps.append(step)
@@ -498,7 +511,11 @@ class Recorder:
         """Make an episode from one that ended or is open. None: only a hole."""
         assert self._part is not None
         end = self._part.end_s if at is None else at
-        if one.kind == S.STALE and one.after_hole and end - one.start < LONGEST_HOLE_S:
+        if (
+            one.kind == S.STALE
+            and one.after_hole
+            and end - one.start < EPISODE_TIMES.longest_hole
+        ):
             return None
         geometry = self._geometry
         names = self._geometry.channel_names
@@ -549,27 +566,42 @@ def _stds(output: Output) -> Array:
 # Size and course of an error, in bounded memory
 
 
-MOST_BATCHES = 512
-"""Largest number of batches. If exceeded, neighbours are merged."""
-FIRST_BATCH_S = 0.1
-"""Width of a batch at first, s."""
-LONGER = 12
-"""Number of merged batches for the standard error. An error is correlated for a shorter time."""
-FEWEST_BATCHES = 4
-"""Smallest number of batches with a meaningful scatter."""
-TREND = 0.3
-"""Smallest change of a trend, as a share of the size."""
-PASSED = 0.25
-"""Share of its former size below which an error is over."""
-SIZE_TIME = 1.0
-"""Time over which the size at the declaration is averaged, s. Also the time for which an error must
-stay below `PASSED` to be over."""
-ROUNDING_SHARE = 1e-12
-"""Share of a mean square that is rounding error."""
-SMALL_MEAN = 0.5
-"""Ratio of mean to scatter below which the error is not described by its mean."""
-LOUD = 3.0
-"""Ratio of scatter to expected noise from which on an error is noise."""
+class _BatchRoom(NamedTuple):
+    """Batches of time over which an error is averaged."""
+
+    #: largest number of batches. If exceeded, neighbours are merged
+    batches: int = 512
+    #: width of a batch at first, s
+    first: float = 0.1
+    #: number of merged batches for the standard error. An error is correlated for a
+    #: shorter time
+    merged: int = 12
+    #: smallest number of batches with a meaningful scatter
+    fewest: int = 4
+
+
+_BATCHES = _BatchRoom()
+
+
+class _Courses(NamedTuple):
+    """What decides how an error is described."""
+
+    #: smallest change of a trend, as a share of the size
+    trend: float = 0.3
+    #: share of its former size below which an error is over
+    passed: float = 0.25
+    #: time over which the size at the declaration is averaged, s. Also the time for
+    #: which an error must stay below `passed` to be over
+    time: float = 1.0
+    #: share of a mean square that is rounding error
+    rounding: float = 1e-12
+    #: ratio of mean to scatter below which the error is not described by its mean
+    small_mean: float = 0.5
+    #: ratio of scatter to expected noise from which on an error is noise
+    loud: float = 3.0
+
+
+_COURSES = _Courses()
 
 
 class Batches:
@@ -594,9 +626,9 @@ class Batches:
         self._noise = noise
         self._scale = scale
         self._bias = bias
-        self._width = FIRST_BATCH_S
+        self._width = _BATCHES.first
         # Number of samples, sum, sum of squares of each batch.
-        self._sums = np.zeros((3, MOST_BATCHES))
+        self._sums = np.zeros((3, _BATCHES.batches))
         self._with_rate = np.zeros(
             2
         )  # sum of error times rate, and of the squared rate
@@ -609,18 +641,18 @@ class Batches:
         rate = np.nan_to_num(rate[known])
         if not len(time):
             return
-        while time[-1] - self._begin >= MOST_BATCHES * self._width:
+        while time[-1] - self._begin >= _BATCHES.batches * self._width:
             self._sums = np.hstack(
                 [
                     self._sums.reshape(3, -1, 2).sum(axis=2),
-                    np.zeros((3, MOST_BATCHES // 2)),
+                    np.zeros((3, _BATCHES.batches // 2)),
                 ]
             )
             self._width *= 2
         number = np.maximum(((time - self._begin) / self._width).astype(np.intp), 0)
-        number = np.minimum(number, MOST_BATCHES - 1)
+        number = np.minimum(number, _BATCHES.batches - 1)
         for k, values in enumerate((None, error, error**2)):
-            self._sums[k] += np.bincount(number, values, MOST_BATCHES)
+            self._sums[k] += np.bincount(number, values, _BATCHES.batches)
         self._with_rate += float(error @ rate), float(rate @ rate)
 
     def size(self, declared: float) -> Size | None:
@@ -637,7 +669,7 @@ class Batches:
         whole = float(total.sum() / count.sum())
         mean_square = float(square.sum() / samples)
         scatter = mean_square - whole**2
-        scatter = scatter if scatter > ROUNDING_SHARE * mean_square else 0.0
+        scatter = scatter if scatter > _COURSES.rounding * mean_square else 0.0
         lasting = math.hypot(
             self._scale * math.sqrt(float(self._with_rate[1]) / samples), self._bias
         )
@@ -655,7 +687,9 @@ class Batches:
             return Size(
                 rms, chance, "proportional", last, share_of_rate=product / rates
             )
-        at = (middle >= declared) & (middle < declared + max(SIZE_TIME, self._width))
+        at = (middle >= declared) & (
+            middle < declared + max(_COURSES.time, self._width)
+        )
         here = mean[at] if at.any() else mean[-1:]
         then = float(here.mean())
         gone = self._gone(used, mean, then)
@@ -667,27 +701,27 @@ class Batches:
             return Size(float(part.mean()), error, "gone", last, gone_s=round(gone, 3))
         slope = _trend(middle, mean)
         change = 0.0 if slope is None else abs(slope) * (middle[-1] - middle[0])
-        if slope is not None and change > TREND * abs(whole):
+        if slope is not None and change > _COURSES.trend * abs(whole):
             course: Course = "growing" if slope * (then or whole) > 0 else "shrinking"
             straight = mean - slope * (middle - middle.mean())
             chance = float(straight.std(ddof=2)) / math.sqrt(len(here))
             return Size(then, math.hypot(chance, lasting), course, last, slope)
-        if abs(whole) < SMALL_MEAN * math.sqrt(scatter):
-            wander = float(mean.var()) if len(mean) >= FEWEST_BATCHES else 0.0
+        if abs(whole) < _COURSES.small_mean * math.sqrt(scatter):
+            wander = float(mean.var()) if len(mean) >= _BATCHES.fewest else 0.0
             if wander > max(0.5 * scatter, (CERTAIN_SIGMAS * std) ** 2):
                 return Size(rms, std, "varying", last)
-            if scatter > (LOUD * self._noise) ** 2:
+            if scatter > (_COURSES.loud * self._noise) ** 2:
                 return Size(rms, rms / math.sqrt(2.0 * samples), "noisy", last)
         return Size(whole, std, "steady", last)
 
     def _gone(self, used: NDArray[np.intp], mean: Array, then: float) -> float | None:
-        """Return the time, s, since which the error is below `PASSED`. None: the error is not over."""
-        large = np.flatnonzero(np.abs(mean) >= PASSED * abs(then))
+        """Return the time, s, since which the error is below `_COURSES.passed`. None: it is not over."""
+        large = np.flatnonzero(np.abs(mean) >= _COURSES.passed * abs(then))
         if not len(large) or large[-1] == len(mean) - 1:
             return None
         since = self._begin + (used[large[-1]] + 1) * self._width
         lasted = self._begin + (used[-1] + 1) * self._width - since
-        return float(since) if lasted >= max(SIZE_TIME, 2 * self._width) else None
+        return float(since) if lasted >= max(_COURSES.time, 2 * self._width) else None
 
 
 def _standard_error(means: Array, scatter: float, samples: float) -> float:
@@ -696,17 +730,19 @@ def _standard_error(means: Array, scatter: float, samples: float) -> float:
     The larger of the two counts.
     """
     by_sample = scatter / max(samples, 1.0)
-    if len(means) >= 2 * LONGER:
-        means = np.array([part.mean() for part in np.array_split(means, LONGER)])
+    if len(means) >= 2 * _BATCHES.merged:
+        means = np.array(
+            [part.mean() for part in np.array_split(means, _BATCHES.merged)]
+        )
     by_batch = (
-        float(means.var(ddof=1)) / len(means) if len(means) >= FEWEST_BATCHES else 0.0
+        float(means.var(ddof=1)) / len(means) if len(means) >= _BATCHES.fewest else 0.0
     )
     return math.sqrt(max(by_sample, by_batch))
 
 
 def _trend(time: Array, mean: Array) -> float | None:
     """Return the slope of a straight line through the means (k,). None: not significant."""
-    if len(mean) < 2 * FEWEST_BATCHES:
+    if len(mean) < 2 * _BATCHES.fewest:
         return None
     x = time - time.mean()
     slope = float(x @ mean / (x @ x))

@@ -14,28 +14,32 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 from fdi_ros.monitor.soundness import REPORTED
-from fdi_ros.replay.episodes import (
-    MOST_STEPS,
-    Episode,
-    Step,
-    Stretch,
-    episode_words,
-)
+from fdi_ros.replay.episodes import ROOM, Episode, Step, Stretch, episode_words
 
-RECURS_WITHIN = 2.0
-"""Longest time between two sets of one fault, s: some swings of a loose unit."""
-LEAST_SETS = 3
-"""Number of sets that are told as one. Two may be two faults."""
-EXPLAINS = 0.9
-"""Share of the time of all sets for which a unit must have been in them to explain them.
-As evidence fades, a set may be one of healthy channels for some samples."""
-STILL_NOISY = 1.0
-"""Noise that ends this close to the end of a stretch, s, lasts to its end. Noise of a
-line falls below its limit for moments."""
-LEAST_NOISY_CHANNELS = 2
-"""Number of channels of a unit whose noise is that of the unit. One is a noisy channel."""
+
+class _LooseUnit(NamedTuple):
+    """Which sets of channels show one loose unit."""
+
+    #: longest time between two sets, s: some swings of a loose unit
+    within: float = 2.0
+    #: number of sets that are reported as one. Two may be two faults
+    sets: int = 3
+    #: share of the time of all sets for which a unit must have been in them to
+    #: explain them. As evidence fades, a set may be one of healthy channels for
+    #: some samples
+    share: float = 0.9
+    #: noise that ends this close to the end of a stretch, s, lasts to its end.
+    #: Noise of a line falls below its limit for moments
+    lasts: float = 1.0
+    #: number of channels of a unit whose noise is that of the unit. One is a noisy
+    #: channel
+    channels: int = 2
+
+
+_LOOSE = _LooseUnit()
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,7 @@ def _noise_after(
         for time in noisy
         if time.measured_in == one.measured_in
         and time.until_s - time.since_s >= REPORTED.noisy_s
-        and one.start_s <= time.since_s <= one.end_s + RECURS_WITHIN
+        and one.start_s <= time.since_s <= one.end_s + _LOOSE.within
     ]
     by_unit: dict[str, list[NoisyTime]] = {}
     for time in after:
@@ -126,9 +130,7 @@ def _noise_after(
         return []
     (unit,) = by_unit
     channels = {time.channel for time in after}
-    if len(channels) < LEAST_NOISY_CHANNELS or unit not in _units_behind(
-        [one], unit_of
-    ):
+    if len(channels) < _LOOSE.channels or unit not in _units_behind([one], unit_of):
         return []
     return after
 
@@ -144,7 +146,7 @@ def _is_inside(
     return (
         later.state == "AMBIGUOUS"
         and later.stretch == run[0].stretch
-        and later.start_s <= until + RECURS_WITHIN
+        and later.start_s <= until + _LOOSE.within
         and unit_of[noisy] in _units_behind([later], unit_of)
     )
 
@@ -170,7 +172,7 @@ def _noisy_unit(
         channels=tuple(name for name in unit_of if name in shown),
         who=unit,
         end_s=last,
-        stands=run[-1].stands or end - last < STILL_NOISY,
+        stands=run[-1].stands or end - last < _LOOSE.lasts,
         candidates=tuple(one for one in whole.candidates if one.channel in shown),
         apart=None,
         noisy_from_s=min(time.since_s for time in times),
@@ -184,7 +186,7 @@ def _recurs(run: Sequence[Episode], one: Episode, unit_of: Mapping[str, str]) ->
     return (
         (last.state, one.state) == ("AMBIGUOUS", "AMBIGUOUS")
         and last.stretch == one.stretch
-        and 0.0 <= one.start_s - last.end_s <= RECURS_WITHIN
+        and 0.0 <= one.start_s - last.end_s <= _LOOSE.within
         and bool(_units_behind(run, unit_of) & _units_behind([one], unit_of))
     )
 
@@ -198,7 +200,7 @@ def _told(run: Sequence[Episode], unit_of: Mapping[str, str]) -> Sequence[Episod
         for step in one.steps
         if {unit_of[name] for name in step.channels} <= units
     ]
-    if len(run) < LEAST_SETS or not own:
+    if len(run) < _LOOSE.sets or not own:
         return run
     widest = max(own, key=lambda step: len(step.channels))
     whole = _whole(run)
@@ -217,8 +219,8 @@ def _whole(run: Sequence[Episode]) -> Episode:
     """Return the longest set of a run with times, steps and evidence of all of them."""
     longest = max(run, key=_longest)
     steps = tuple(step for one in run for step in one.steps)
-    if len(steps) > MOST_STEPS:
-        steps = (*steps[: MOST_STEPS - 1], steps[-1])
+    if len(steps) > ROOM.steps:
+        steps = (*steps[: ROOM.steps - 1], steps[-1])
     last_alarms = [one.evidence.last_alarm_s for one in run]
     ratios = [one.evidence.ratio for one in run]
     return replace(
@@ -260,7 +262,7 @@ def _units_behind(
     return frozenset(
         unit
         for unit, seconds in by_unit.items()
-        if unit and seconds >= EXPLAINS * total
+        if unit and seconds >= _LOOSE.share * total
     )
 
 

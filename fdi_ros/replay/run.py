@@ -42,7 +42,7 @@ from fdi_ros.monitor.soundness import (
     checked_share,
 )
 from fdi_ros.monitor.status import Status
-from fdi_ros.replay.episodes import STRETCH_GAP, Story, join_halves, pieces
+from fdi_ros.replay.episodes import EPISODE_TIMES, Story, join_halves, pieces
 from fdi_ros.replay.health import (
     Deliveries,
     UsualNoise,
@@ -141,9 +141,12 @@ class Walk:
         """Cut a block at gaps. The caller feeds each piece before the next one."""
         if not len(block):
             yield block
-        for rows in pieces(block.stamp, STRETCH_GAP):
+        for rows in pieces(block.stamp, EPISODE_TIMES.stretch_gap):
             first = int(block.stamp[rows.start])
-            if self._last is not None and first - self._last > STRETCH_GAP * 1e9:
+            if (
+                self._last is not None
+                and first - self._last > EPISODE_TIMES.stretch_gap * 1e9
+            ):
                 self.begin_stretch(first)
             self._last = int(block.stamp[rows.stop - 1])
             yield block[rows]

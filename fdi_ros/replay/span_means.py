@@ -25,15 +25,24 @@ from fdi_ros.replay.episodes import Episode, Story, Stretch, warming_words
 from fdi_ros.replay.outcomes import SQUARED
 from fdi_ros.replay.warming import LARGEST_SLOPE, Warming, fit_warming
 
-MOST_SPANS = 512
-"""Largest number of spans. If exceeded, neighbours are merged."""
-FIRST_SPAN_S = 1.0
-"""Width of a span at first, s. Temperatures of chips change more slowly."""
-LEAST_FILLED = 0.9
-"""Share of the samples of a span that a channel must have for a mean. In motion, means of other
-samples are means of other rates."""
-LEAST_COVERED = 0.5
-"""Share of the spans of a stretch in which a channel must have a mean to measure others."""
+
+class _Spans(NamedTuple):
+    """Spans of time over which values are averaged."""
+
+    #: largest number of spans. If exceeded, neighbours are merged
+    most: int = 512
+    #: width of a span at first, s. Temperatures of chips change more slowly
+    first: float = 1.0
+    #: share of the samples of a span that a channel must have for a mean. In
+    #: motion, means of other samples are means of other rates
+    filled: float = 0.9
+    #: share of the spans of a stretch in which a channel must have a mean to
+    #: measure others
+    covered: float = 0.5
+
+
+SPANS = _Spans()
+
 _UNUSED = (ChannelState.STALE, ChannelState.EXCLUDED)
 """States in which a value says nothing of the vehicle: it is old, or another unit's."""
 
@@ -55,9 +64,9 @@ class SpanMeans:
         self._quantity = quantity
         self._begin = np.nan
         """Begin of the first span, s from the first message."""
-        self._width = FIRST_SPAN_S
-        self._counts = np.zeros((geometry.n, MOST_SPANS))
-        self._totals = np.zeros((geometry.n, MOST_SPANS))
+        self._width = SPANS.first
+        self._counts = np.zeros((geometry.n, SPANS.most))
+        self._totals = np.zeros((geometry.n, SPANS.most))
 
     def add(self, time: Array, values: Array, state: NDArray[np.uint8]) -> None:
         """Add the next samples.
@@ -69,7 +78,7 @@ class SpanMeans:
             return
         if np.isnan(self._begin):
             self._begin = float(time[0])
-        while time[-1] - self._begin >= MOST_SPANS * self._width:
+        while time[-1] - self._begin >= SPANS.most * self._width:
             self._counts = _merged(self._counts)
             self._totals = _merged(self._totals)
             self._width *= 2
@@ -78,8 +87,8 @@ class SpanMeans:
         span = np.maximum((time - self._begin) / self._width, 0.0).astype(np.intp)
         for i in range(self._geometry.n):
             own = known[:, i]
-            self._counts[i] += np.bincount(span[own], minlength=MOST_SPANS)
-            self._totals[i] += np.bincount(span[own], values[own, i], MOST_SPANS)
+            self._counts[i] += np.bincount(span[own], minlength=SPANS.most)
+            self._totals[i] += np.bincount(span[own], values[own, i], SPANS.most)
 
     def warming(
         self,
@@ -134,7 +143,7 @@ class SpanMeans:
         inside = (middle >= part.start_s) & (middle <= part.end_s)
         spans = spans[inside]
         counts = self._counts[:, spans]
-        enough = counts >= LEAST_FILLED * most[spans]
+        enough = counts >= SPANS.filled * most[spans]
         means = np.full(counts.shape, np.nan)
         means[enough] = self._totals[:, spans][enough] / counts[enough]
         return np.asarray(middle[inside], dtype=np.float64), means.T
@@ -150,7 +159,7 @@ class SpanMeans:
             for k, (name, share) in enumerate(
                 zip(self._geometry.channel_names, covered, strict=False)
             )
-            if name not in left_out and share >= LEAST_COVERED
+            if name not in left_out and share >= SPANS.covered
         ]
         axes = self._geometry.axes[others]
         if not spans_space(axes):
@@ -160,7 +169,7 @@ class SpanMeans:
 
 
 def _merged(values: Array) -> Array:
-    """Merge each two neighbours of sums (n, MOST_SPANS)."""
+    """Merge each two neighbours of sums (n, SPANS.most)."""
     pairs = values.reshape(len(values), -1, 2).sum(axis=2)
     return np.hstack([pairs, np.zeros_like(pairs)])
 

@@ -210,7 +210,7 @@ class Judgement:
 
     @property
     def has_only_brief_sets(self) -> bool:
-        """Whether all that was declared are sets that ended within `BRIEF`.
+        """Whether all that was declared are sets that ended within `EPISODE_TIMES.brief`.
 
         Evidence for one channel does not last while its error changes its sign, as noise does.
         """

@@ -22,9 +22,8 @@ from fdi_ros.monitor.soundness import (
     word_of,
 )
 from fdi_ros.replay.episodes import (
-    BRIEF,
-    LEAST_BEFORE,
-    MOST_TOLD,
+    EPISODE_TIMES,
+    ROOM,
     Episode,
     Size,
     course_word,
@@ -221,7 +220,7 @@ def _faulty_sentences(
             *_size_sentences(first, unit),
             *_reason_sentences(first),
         ]
-    if first.since_s - first.start_s >= LEAST_BEFORE:
+    if first.since_s - first.start_s >= EPISODE_TIMES.least_before:
         sentences.append(f"First seen at {first.start_s:.1f} s.")
     lasting = _without_brief_sets(faulty)
     heat = [words for one in lasting if (words := warming_words(one, unit))]
@@ -245,18 +244,20 @@ def _other_names(others: Sequence[str]) -> str:
     if len(others) == 2:
         return listed(others)
     has_commas = any("," in one for one in others)
-    return first_of(others, MOST_TOLD, "; " if has_commas else ", ")
+    return first_of(others, ROOM.episodes, "; " if has_commas else ", ")
 
 
 def _without_brief_sets(faulty: Sequence[Episode]) -> Sequence[Episode]:
-    """Return the episodes without sets that ended within `BRIEF`, unless they are all like that.
+    """Return the episodes without sets that ended within `EPISODE_TIMES.brief`, unless they are all like that.
 
     A brief set confirms no channel. Beside a declaration that lasts, it asks for nothing.
     """
     lasting = [
         one
         for one in faulty
-        if one.state != "AMBIGUOUS" or one.stands or one.end_s - one.since_s >= BRIEF
+        if one.state != "AMBIGUOUS"
+        or one.stands
+        or one.end_s - one.since_s >= EPISODE_TIMES.brief
     ]
     return lasting or faulty
 
@@ -380,7 +381,7 @@ def _when(one: Episode) -> str:
     since = f"from {one.since_s:.1f} s"
     lasted = one.end_s - one.since_s
     if not one.stands:
-        brief = f", for {1000 * lasted:.0f} ms" if lasted < BRIEF else ""
+        brief = f", for {1000 * lasted:.0f} ms" if lasted < EPISODE_TIMES.brief else ""
         since += brief or f" to {one.end_s:.1f} s"
     if one.state == "STALE":
         return f"gives no data {since}"

@@ -23,28 +23,39 @@ import numpy as np
 from fdi_ros.model.quantity import FORCE, RATE
 from fdi_ros.model.samples import Array
 
-LEAST_SPANS = 20
-"""Smallest number of means. The model has five constants, and a step two more choices."""
-LEAST_WARMING = 3.0
-"""Smallest range of temperature, degC. Healthy flights in the recorded logs that begin with a
-warm vehicle have 0.2 to 1.5 degC."""
-LEAST_EXPLAINED = 0.9
-"""Smallest share of the variance beside s v that the temperature explains. In the log of a
-real gyro that warms it is 0.987 and 0.993, and of its healthy channels at most 0.83."""
-LEAST_OF_ALL = 0.5
-"""Smallest share of the whole variance that the temperature explains alone. With less, the
-error is mostly one of scale."""
-RIVAL_RATIO = 3.0
-"""Unexplained variance of a model over that of another from which on the other is the better one.
-In that log steps and lines leave 5 to 32 times as much as the temperature. Of 16 000 random
-walks beside temperatures that have no part in them, a ratio of 1.5 calls 44 warming, 2 calls 14
-and 3 none. It leaves 102 open."""
+
+class _WarmingSigns(NamedTuple):
+    """What shows that an error follows the temperature."""
+
+    #: smallest number of means. The model has five constants, and a step two more
+    #: choices
+    spans: int = 20
+    #: smallest range of temperature, degC. Healthy flights in the recorded logs
+    #: that begin with a warm vehicle have 0.2 to 1.5 degC
+    warming: float = 3.0
+    #: smallest share of the variance beside s v that the temperature explains. In
+    #: the log of a real gyro that warms it is 0.987 and 0.993, and of its healthy
+    #: channels at most 0.83
+    explained: float = 0.9
+    #: smallest share of the whole variance that the temperature explains alone.
+    #: With less, the error is mostly one of scale
+    of_all: float = 0.5
+    #: unexplained variance of a model over that of another from which on the other
+    #: is the better one. In that log steps and lines leave 5 to 32 times as much as
+    #: the temperature. Of 16 000 random walks beside temperatures that have no part
+    #: in them, a ratio of 1.5 calls 44 warming, 2 calls 14 and 3 none. It leaves
+    #: 102 open
+    rival_ratio: float = 3.0
+    #: share of a sum of squares, or of a singular value, that is rounding error
+    rounding: float = 1e-9
+
+
+WARMING_SIGNS = _WarmingSigns()
+
 LARGEST_SLOPE = {RATE.unit: 0.01, FORCE.unit: 0.03}
 """Largest change of a bias by temperature, in the unit of the channel per degC.
 About twice that of the data sheet of the MPU-6000 (PS-MPU-6000A-00): 20 deg/s over the 60 degC
 from 25 to 85 degC, and 60 mg over the 45 degC from 25 to 70 degC. A larger error is a fault."""
-_ROUNDING = 1e-9
-"""Share of a sum of squares, or of a singular value, that is rounding error."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +87,7 @@ class Fit(NamedTuple):
     explained: float
     """Share of the variance beside s v that the temperature explains."""
     certain: bool
-    """Whether steps and straight lines in time explain the error worse by `RIVAL_RATIO`."""
+    """Whether steps and straight lines in time explain the error worse by `WARMING_SIGNS.rival_ratio`."""
 
 
 def fit_warming(
@@ -105,30 +116,36 @@ def fit_warming(
     """
     rows = np.column_stack([time, error, temperature, vector])
     rows = rows[np.isfinite(rows).all(axis=1)]
-    if len(rows) < LEAST_SPANS:
+    if len(rows) < WARMING_SIGNS.spans:
         return None
     time, error, temperature = rows[:, :3].T
     warming = float(np.ptp(temperature))
-    if warming < LEAST_WARMING:
+    if warming < WARMING_SIGNS.warming:
         return None
     constant = np.ones((len(rows), 1))
     alone = _Regression(error, constant)
-    if alone.share_left(temperature[:, None])[0] > 1.0 - LEAST_OF_ALL:
+    if alone.share_left(temperature[:, None])[0] > 1.0 - WARMING_SIGNS.of_all:
         return None
     beside = _Regression(error, np.hstack([constant, rows[:, 3:]]))
     left = float(beside.share_left(temperature[:, None])[0])
     slope = beside.slope(temperature)
-    if not (left <= 1.0 - LEAST_EXPLAINED and abs(slope) <= largest_slope):
+    if not (left <= 1.0 - WARMING_SIGNS.explained and abs(slope) <= largest_slope):
         return None
     since = time[:, None] - time[None, :-1]
     step = float(beside.share_left((since > 0.0).astype(np.float64)).min())
     line = float(beside.share_left(np.maximum(since, 0.0)).min())
-    left = max(left, _ROUNDING)
-    if step < RIVAL_RATIO * left or RIVAL_RATIO * line < left:
+    left = max(left, WARMING_SIGNS.rounding)
+    if (
+        step < WARMING_SIGNS.rival_ratio * left
+        or WARMING_SIGNS.rival_ratio * line < left
+    ):
         return None
     falls = _Regression(temperature, constant).slope(time) < 0.0
     return Fit(
-        slope, -warming if falls else warming, 1.0 - left, line >= RIVAL_RATIO * left
+        slope,
+        -warming if falls else warming,
+        1.0 - left,
+        line >= WARMING_SIGNS.rival_ratio * left,
     )
 
 
@@ -141,11 +158,11 @@ class _Regression:
 
     def __init__(self, error: Array, columns: Array) -> None:
         basis, size, _ = np.linalg.svd(columns, full_matrices=False)
-        self._basis = basis[:, size > _ROUNDING * size[0]]
+        self._basis = basis[:, size > WARMING_SIGNS.rounding * size[0]]
         self._error = self._rest(error[:, None])[:, 0]
         self._square = float(self._error @ self._error)
         total = float(error @ error)
-        if self._square <= _ROUNDING**2 * total:
+        if self._square <= WARMING_SIGNS.rounding**2 * total:
             # What is left is rounding error, and nothing has to be explained.
             self._square = 0.0
 
@@ -153,7 +170,7 @@ class _Regression:
         """Return the share of the variance that each of the candidates (k, m) leaves, (m,)."""
         rest = self._rest(candidates)
         square = (rest**2).sum(axis=0)
-        known = square > _ROUNDING * (candidates**2).sum(axis=0)
+        known = square > WARMING_SIGNS.rounding * (candidates**2).sum(axis=0)
         if not self._square:
             return np.ones(len(square))
         product = self._error @ rest

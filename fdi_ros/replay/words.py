@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple
-from typing import Any
+from typing import Any, NamedTuple
 
 from fdi_ros.config.unit_names import short_names
 from fdi_ros.faults.fault import ACCELEROMETERS
@@ -16,7 +16,7 @@ from fdi_ros.monitor.diagnostics import UNUSED_COUNTERS
 from fdi_ros.monitor.receiver import RATE_TOLERANCE
 from fdi_ros.monitor.soundness import REPORTED, Concern, Trouble, UnitHealth, Word
 from fdi_ros.replay.episodes import (
-    MOST_TOLD,
+    ROOM,
     Episode,
     Story,
     detail_words,
@@ -49,10 +49,18 @@ from fdi_ros.system.text import figures, first_of, listed, percent, shown, span
 
 AUTOPILOT_LOGS = (".bin", ".tlog")
 """Suffixes of the logs of ArduPilot."""
-FOLDED = 4
-"""Episodes without data for one reason from which on a terminal shows them as one."""
-SHOWN_EPISODES = 20
-"""Episodes that a terminal shows with all their details."""
+
+
+class _TerminalRoom(NamedTuple):
+    """What a terminal shows of the episodes."""
+
+    #: episodes without data for one reason from which on they are shown as one
+    folded: int = 4
+    #: episodes with all their details
+    episodes: int = 20
+
+
+TERMINAL_ROOM = _TerminalRoom()
 
 
 def sentences(summary: Summary, unit: Unit = RADIANS) -> list[str]:
@@ -243,12 +251,14 @@ def _unexplained_lines(summary: Summary, unit: Unit) -> list[str]:
     unexplained = [one for one in story.declared if not one.injected]
     if unexplained:
         count = f"{len(unexplained)} episode{'s' if len(unexplained) > 1 else ''}"
-        first = f", the first {MOST_TOLD}" if len(unexplained) > MOST_TOLD else ""
+        first = (
+            f", the first {ROOM.episodes}" if len(unexplained) > ROOM.episodes else ""
+        )
         lines = [f"{count} that no injected fault explains{first}:"]
-        for one in unexplained[:MOST_TOLD]:
+        for one in unexplained[: ROOM.episodes]:
             where = f"stretch {one.stretch}: " if len(story.stretches) > 1 else ""
             lines.append(f"{where}{episode_words(one, unit)}.")
-        if more := len(unexplained[MOST_TOLD:]) + story.more:
+        if more := len(unexplained[ROOM.episodes :]) + story.more:
             lines.append(f"And {more} more episode{'s' if more > 1 else ''}.")
         return lines
     if wrong := wrongly_named(summary):
@@ -449,7 +459,7 @@ def _episodes(story: Story, scored: bool, unit: Unit) -> str:
     """List the episodes: channels, time and size, then the details."""
     silent, folded = _folded(story)
     shown_ones = [one for one in story.episodes if one not in silent]
-    first = shown_ones[:SHOWN_EPISODES]
+    first = shown_ones[: TERMINAL_ROOM.episodes]
     lines = ["\nwhat happened\n"] if first else []
     for place, one in enumerate(first, 1):
         where = f" (stretch {one.stretch})" if len(story.stretches) > 1 else ""
@@ -471,11 +481,13 @@ def _folded(story: Story) -> tuple[list[Episode], list[str]]:
     for one in story.episodes:
         if not one.declares and not one.injected:
             alike.setdefault(one.evidence.reason, []).append(one)
-    alike = {why: some for why, some in alike.items() if len(some) >= FOLDED}
+    alike = {
+        why: some for why, some in alike.items() if len(some) >= TERMINAL_ROOM.folded
+    }
     words = []
     for why, some in alike.items():
         channels = sorted({name for one in some for name in one.channels})
-        who = first_of(short_names(channels), MOST_TOLD)
+        who = first_of(short_names(channels), ROOM.episodes)
         begin = some[0].start_s
         end = max(one.end_s for one in some)
         words.append(

@@ -151,8 +151,19 @@ def told(columns: Iterable[Column], unit: Unit = RADIANS) -> Rows:
     ), list(zip(*cells, strict=True))
 
 
-LONGEST_FIGURE = 24
-"""Characters of the longest figure with its error and unit. A longer cell is a text."""
+class _Lengths(NamedTuple):
+    """How much fits beside and below one another."""
+
+    #: characters of the longest figure with its error and unit. A longer cell is a
+    #: text
+    figure: int = 24
+    #: length of a line of sentences in a terminal, characters
+    terminal: int = 110
+    #: rows of a table on paper, as in page.css
+    paper_rows: int = 60
+
+
+LENGTHS = _Lengths()
 
 
 def table(
@@ -161,7 +172,7 @@ def table(
     """Lay out lines of text in columns, with control characters escaped.
 
     ``figures``: the columns after the first hold figures and are aligned to the right, but for those
-    with a cell longer than `LONGEST_FIGURE`. Otherwise all columns are aligned to the left, and long
+    with a cell longer than `LENGTHS.figure`. Otherwise all columns are aligned to the left, and long
     texts are shortened.
     """
     most = LINE if figures else WORD
@@ -171,7 +182,7 @@ def table(
         max(map(len, column), default=0) for column in zip(*lines[1:], strict=True)
     ]
     right = [
-        figures and k > 0 and long <= LONGEST_FIGURE
+        figures and k > 0 and long <= LENGTHS.figure
         for k, long in enumerate(longest or width)
     ]
     form = "  ".join(
@@ -214,10 +225,6 @@ PALETTE = (
 """Colours that colour-blind people can distinguish (after Okabe and Ito)."""
 CHANNEL_COLOURS = (*PALETTE, "#9a4dff", "#e20134", "#00b4a0")
 """Colours of the channels."""
-TERMINAL = 110
-"""Length of a line of sentences, characters."""
-PAPER_ROWS = 60
-"""Rows of a table on paper, as in page.css."""
 TIME_AXIS = "s from the first sample"
 _SCRIPTS = (
     "plot_data.js",
@@ -293,7 +300,7 @@ Part = Section | Pair
 
 def section_lines(section: Section) -> list[str]:
     """Lay out a section for a terminal, without plots. The content must be no HTML."""
-    lines = [section.title, *textwrap.wrap(section.hint, TERMINAL)]
+    lines = [section.title, *textwrap.wrap(section.hint, LENGTHS.terminal)]
     return [
         *lines,
         *(
@@ -327,11 +334,11 @@ def html_table(
     rows = list(rows)
     cells = "".join(_cell(name, "th scope=col") for name in head)
     body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
-    paper = f'<p class="paper">On paper the first {PAPER_ROWS} of {len(rows)} rows.</p>'
+    paper = f'<p class="paper">On paper the first {LENGTHS.paper_rows} of {len(rows)} rows.</p>'
     return (
         '<div class="scroll" tabindex="0" role="region" aria-label="table">'
         f"<table{' class=sort' if sort else ''}><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>"
-        + (paper if len(rows) > PAPER_ROWS else "")
+        + (paper if len(rows) > LENGTHS.paper_rows else "")
     )
 
 

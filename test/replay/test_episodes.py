@@ -25,7 +25,7 @@ from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Event, Output
 from fdi_ros.monitor.pipeline import Pipeline
 from fdi_ros.replay.episodes import (
-    STRETCH_GAP,
+    EPISODE_TIMES,
     Candidate,
     Size,
     _growth,
@@ -350,7 +350,9 @@ def test_stretches_are_cut_at_gaps_and_nowhere_else(steps, count):
     for part in np.array_split(stamp, count):
         for block in walk.pieces(Block(part, np.zeros((len(part), 6)))):
             found[-1] += block.stamp.tolist()
-    assert found == [stamp[rows].tolist() for rows in pieces(stamp, STRETCH_GAP)]
+    assert found == [
+        stamp[rows].tolist() for rows in pieces(stamp, EPISODE_TIMES.stretch_gap)
+    ]
     assert [at for part in found for at in part] == stamp.tolist()
 
 

@@ -30,7 +30,7 @@ from fdi_ros.monitor.soundness import (
     own_noise,
     word_of,
 )
-from fdi_ros.replay.health import MOST_WINDOWS, Deliveries
+from fdi_ros.replay.health import WINDOWS, Deliveries
 from fdi_ros.replay.run import replay
 from fdi_ros.replay.verdict import _other_names, _without_brief_sets
 from fdi_ros.replay.words import sentences
@@ -541,7 +541,7 @@ def test_messages_that_arrive_irregularly_are_all_there(rate, spread, seed):
 
 
 def test_memory_of_deliveries_does_not_grow_with_the_recording():
-    long = np.arange(0.0, 3.0 * MOST_WINDOWS, 0.5)
+    long = np.arange(0.0, 3.0 * WINDOWS.most, 0.5)
     (delivery,) = tapped([long], 1)
     assert delivery.share > 0.99
     assert delivery.rate == pytest.approx(2.0, rel=0.01)

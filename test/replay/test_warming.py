@@ -19,15 +19,8 @@ from fdi_ros.core.states import ChannelState
 from fdi_ros.model.geometry import Geometry
 from fdi_ros.replay.episodes import Story, Stretch, warming_words
 from fdi_ros.replay.run import replay
-from fdi_ros.replay.span_means import MOST_SPANS, SpanMeans, Temperature, with_warming
-from fdi_ros.replay.warming import (
-    LARGEST_SLOPE,
-    LEAST_EXPLAINED,
-    LEAST_SPANS,
-    LEAST_WARMING,
-    Warming,
-    fit_warming,
-)
+from fdi_ros.replay.span_means import SPANS, SpanMeans, Temperature, with_warming
+from fdi_ros.replay.warming import LARGEST_SLOPE, WARMING_SIGNS, Warming, fit_warming
 from fdi_ros.report.layout import DEGREES
 
 CRASH = ROOT.parent / "shared" / "data" / "logs" / "quad_imu0_warms_and_crashes.bin"
@@ -171,16 +164,16 @@ def test_any_values_give_nothing_or_a_fit_within_its_bounds(rows, warms):
     if fit is None:
         return
     finite = np.isfinite(table).all(axis=1)
-    assert finite.sum() >= LEAST_SPANS
+    assert finite.sum() >= WARMING_SIGNS.spans
     assert abs(fit.range) == pytest.approx(np.ptp(temperature[finite]))
-    assert abs(fit.range) >= LEAST_WARMING
-    assert LEAST_EXPLAINED <= fit.explained <= 1.0
+    assert abs(fit.range) >= WARMING_SIGNS.warming
+    assert WARMING_SIGNS.explained <= fit.explained <= 1.0
     assert abs(fit.slope) <= LARGEST_SLOPE["rad/s"]
 
 
 @pytest.mark.parametrize(
     ("warming", "slope", "count"),
-    [(2.9, 0.005, 90), (12.0, 0.011, 90), (12.0, 0.005, LEAST_SPANS - 1)],
+    [(2.9, 0.005, 90), (12.0, 0.011, 90), (12.0, 0.005, WARMING_SIGNS.spans - 1)],
 )
 def test_little_warming_large_errors_and_short_records_explain_nothing(
     warming, slope, count
@@ -265,7 +258,7 @@ def declared(*channels, state="FAULTY"):
 
 @pytest.mark.parametrize(("count", "rate"), [(3_000, 50.0), (6_000, 1.0)])
 def test_recordings_of_a_minute_and_of_hours_have_the_same_slope(count, rate):
-    assert rate > 1.0 or count > 4 * MOST_SPANS
+    assert rate > 1.0 or count > 4 * SPANS.most
     one = explained(*stream(count, rate), declared("imu_1.x"))
     (warming,) = one.warming
     assert (warming.channel, warming.unit, warming.certain) == (
