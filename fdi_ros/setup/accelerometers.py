@@ -30,7 +30,7 @@ from fdi_ros.monitor.accelerometers import (
     possible_units,
 )
 from fdi_ros.monitor.building import UNIT_DELAY, build_geometry
-from fdi_ros.setup.agreement import LEAST_RESPONSE
+from fdi_ros.setup.agreement import AGREEMENT
 from fdi_ros.setup.blocks import Data, prepare, resampled, spikes
 from fdi_ros.setup.channels import ChannelFit
 from fdi_ros.setup.estimate import (
@@ -203,7 +203,7 @@ def _check_forces(z: Array, units: Sequence[str], unit: Int, axes: Array) -> Non
     ratio = size / np.maximum(others, 1e-9)
     odd = int(np.abs(np.log(np.maximum(ratio, 1e-9))).argmax())
     name = units[whole[odd]]
-    if not LEAST_RESPONSE < ratio[odd] < 1.0 / LEAST_RESPONSE:
+    if not AGREEMENT.response < ratio[odd] < 1.0 / AGREEMENT.response:
         raise DisagreementError(
             f"the accelerometers of {name} measure {figures(ratio[odd])} times the specific force of the others: look"
             " at its unit (m/s^2), or name them in excluded_channels"

@@ -28,11 +28,19 @@ from fdi_ros.model.samples import Array, Int
 from fdi_ros.setup.blocks import Data
 from fdi_ros.system.text import figures, percent
 
-#: smallest response of a channel to the rotation of others, and the reverse
-LEAST_RESPONSE = 0.3
-#: Share of rotation in common from which two units show one rotation, along other axes
-#: or on another scale.
-SAME = 0.9
+
+class _Agreement(NamedTuple):
+    """From where the rotations of two units agree."""
+
+    #: smallest response of a channel to the rotation of others, and the reverse
+    response: float = 0.3
+    #: share of rotation in common from which two units show one rotation, along
+    #: other axes or on another scale
+    same: float = 0.9
+
+
+AGREEMENT = _Agreement()
+
 _OR_EXCLUDE = "or name its channels in excluded_channels"
 SIGNED_AXES = [  # all 48 ways to swap and reverse three axes
     np.eye(3)[list(order)] * np.array(signs)[:, None]
@@ -143,7 +151,8 @@ def _have_one_scale(turns: _Turns) -> NDArray[np.bool_]:
     variances = [np.linalg.eigvalsh(one) for one in covariances]
     along = np.sqrt(np.maximum(variances, 1e-18))
     least = np.maximum(turns.ratio, (along[:, None] / along[None]).max(axis=2))
-    return (least > LEAST_RESPONSE) & (least.T > LEAST_RESPONSE)
+    is_alike = least > AGREEMENT.response
+    return is_alike & is_alike.T
 
 
 def _joined(turns: _Turns, chosen: Int) -> str:
@@ -162,7 +171,7 @@ def _other_axes(turns: _Turns, nominal: Geometry, odd: int, most: Int) -> str:
     shares = [
         _in_common(turns.means[:, unit], expected @ signed.T) for signed in SIGNED_AXES
     ]
-    if max(shares) < SAME:
+    if max(shares) < AGREEMENT.same:
         return (
             f"{turns.names[odd]} does not measure the rotation of {_joined(turns, most)}"
             f" ({percent(max(*shares, 0.0))} shared): its mount in the config is wrong, it is not"
@@ -264,9 +273,10 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
         if seen < TURNS.least_rotation:
             return []
         response = float(gain @ square[three, i]) / seen**2
-        small = abs(response) < LEAST_RESPONSE and size < LEAST_RESPONSE * seen
+        small = abs(response) < AGREEMENT.response and size < AGREEMENT.response * seen
         large = (
-            abs(response) > 1 / LEAST_RESPONSE and abs(response) * seen > SAME * size
+            abs(response) > 1 / AGREEMENT.response
+            and abs(response) * seen > AGREEMENT.same * size
         )
         if not small and not large:
             return []
@@ -276,12 +286,20 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
 
 #: rotation about some axis, root mean square, below which nothing turns, rad/s
 LEAST_RATE = TURNS.least_rotation / 5
-#: Standard error beyond which axes along axes are an assumption, rad.
-LARGEST_DOUBT = TURNS.square
-#: a mount less certain than this, in any direction, is not shown
-LARGEST_ERROR = np.radians(2.0)
-#: standard errors from which a delay or a mount off the axes is shown
-SHOWN_ERRORS = 3.0
+
+
+class _MountErrors(NamedTuple):
+    """Which errors of mounts and delays are shown."""
+
+    #: standard error beyond which axes along axes are an assumption, rad
+    doubt: float = TURNS.square
+    #: a mount less certain than this, in any direction, is not shown, rad
+    largest: float = np.radians(2.0)
+    #: standard errors from which a delay or a mount off the axes is shown
+    sigmas: float = 3.0
+
+
+MOUNT_ERRORS = _MountErrors()
 
 
 @dataclass(frozen=True)
@@ -306,7 +324,7 @@ class Mount:
     @property
     def shown(self) -> bool:
         """Whether the recording shows the mount; otherwise `rotation` is assumed or None."""
-        return self.rotation is not None and self.error < LARGEST_DOUBT
+        return self.rotation is not None and self.error < MOUNT_ERRORS.doubt
 
 
 def find_mounts(data: Data) -> tuple[Mount, ...]:
@@ -346,7 +364,7 @@ def _against(first: Array, unit: Array) -> Mount:
     shared = 1.0 - missed
     error = math.sqrt(float(np.mean(square)) * uncertainty)
     square_mirrored = (first - unit @ mirrored.T) ** 2
-    if shared < SAME < 1.0 - float(square_mirrored.sum()) / power:
+    if shared < AGREEMENT.same < 1.0 - float(square_mirrored.sum()) / power:
         return Mount(
             "NOT KNOWN: mirrored relative to the first unit",
             shared,
@@ -357,7 +375,7 @@ def _against(first: Array, unit: Array) -> Mount:
     if shared < 0.5:
         words = f"NOT KNOWN: it does not measure the rotation of the first unit ({percent(max(shared, 0.0))} shared)"
         return Mount(words, shared, contradicts=True)
-    if error > LARGEST_ERROR:
+    if error > MOUNT_ERRORS.largest:
         words = f"it turns too little about a second axis ({figures(most, 2)} and {figures(second, 2)} rad/s rms)"
         return Mount(
             f"NOT KNOWN: {words}: uncertain by {min(np.degrees(error), 180.0):.1f} deg",
@@ -368,7 +386,7 @@ def _against(first: Array, unit: Array) -> Mount:
     # Of all signed axes, a mirrored one is never the nearest.
     nearest = min(SIGNED_AXES, key=lambda axes: float(np.linalg.norm(axes - rotation)))
     off = angle_of(nearest.T @ rotation)
-    if off > max(TURNS.square, SHOWN_ERRORS * doubt):
+    if off > max(TURNS.square, MOUNT_ERRORS.sigmas * doubt):
         words = f"turned by {np.degrees(angle_of(rotation)):.1f} +- {np.degrees(error):.1f} deg"
         return Mount(words, shared, np.round(rotation, 6), 0.0, error)
     error = max(error, doubt)
@@ -376,7 +394,7 @@ def _against(first: Array, unit: Array) -> Mount:
         f"{body} is its {axis}"
         for body, axis in zip("xyz", _axes_of(nearest), strict=True)
     )
-    if error >= LARGEST_DOUBT:
+    if error >= MOUNT_ERRORS.doubt:
         # The identity is the assumption of a starting config.
         words = f"NOT MEASURED, uncertain by {np.degrees(error):.0f} deg: vibration"
         words += " masks the turns that would show it"

@@ -12,6 +12,7 @@ samples, for channels that have all. A window has 25 blocks.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,18 @@ from fdi_ros.inspection.turns import TURNS
 from fdi_ros.model.samples import Array, Block, Int, Mask
 from fdi_ros.setup.noise import projector
 
-#: samples looked at at once
-SPIKE_PORTION = 256
+
+class _Portions(NamedTuple):
+    """Samples that are worked on at once, about."""
+
+    #: samples in which spikes are looked for
+    spikes: int = 256
+    #: samples that are interpolated
+    samples: int = 100_000
+
+
+_PORTIONS = _Portions()
+
 #: windows are joined down to this number of groups
 MOST_GROUPS = 400
 
@@ -97,12 +108,12 @@ def spikes(z: Array, axes: Array) -> Mask:
     found = np.zeros(z.shape, dtype=bool)
     apart = projector(axes)
     # Vibration changes the usual size.
-    for first in range(0, max(len(z) - 2, 0), SPIKE_PORTION):
-        part = z[first : first + SPIKE_PORTION + 2]
+    for first in range(0, max(len(z) - 2, 0), _PORTIONS.spikes):
+        part = z[first : first + _PORTIONS.spikes + 2]
         neighbours = 0.5 * (part[2:] + part[:-2])
         size = np.abs((part[1:-1] - neighbours) @ apart)
         whole = size[np.isfinite(size).all(axis=1)]
-        if len(whole) < SPIKE_PORTION // 4:
+        if len(whole) < _PORTIONS.spikes // 4:
             continue
         # 1.4826: deviation of normal errors over their median absolute value.
         level = 1.4826 * np.median(whole, axis=0)
@@ -125,8 +136,6 @@ def flag_runs(flags: Mask) -> Int:
 POINTS = 6
 #: share of a window that a channel must deliver
 PRESENT = 0.8
-#: samples worked on at once, about
-PORTION_SAMPLES = 100_000
 #: smallest delay to correct, s: at 100 rad/s^2 an error of 1e-4 rad/s
 NOT_SHIFTED = 1e-6
 
@@ -232,9 +241,9 @@ def resampled(data: Data, delay: Array) -> tuple[Array, Array]:
         count = 0
         usual = float(np.median(np.diff(knots))) if len(rows) > 1 else 0.0
         z[:, alike] = np.nan
-        for begin in range(0, len(z), PORTION_SAMPLES):
+        for begin in range(0, len(z), _PORTIONS.samples):
             first, weight = lagrange_weights(
-                knots, seconds[begin : begin + PORTION_SAMPLES] + delay[i], usual
+                knots, seconds[begin : begin + _PORTIONS.samples] + delay[i], usual
             )
             known = np.flatnonzero(first >= 0)
             around = rows[first[known, None] + np.arange(POINTS)]

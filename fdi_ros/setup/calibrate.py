@@ -46,7 +46,7 @@ from fdi_ros.setup.accelerometers import (
     fit_accelerometers,
     prepare_accelerometers,
 )
-from fdi_ros.setup.agreement import LEAST_RATE, SHOWN_ERRORS, check_agreement
+from fdi_ros.setup.agreement import LEAST_RATE, MOUNT_ERRORS, check_agreement
 from fdi_ros.setup.blocks import (
     NOT_SHIFTED,
     Data,
@@ -66,23 +66,41 @@ from fdi_ros.setup.estimate import (
 from fdi_ros.setup.positions import Position, find_positions, position_settings
 from fdi_ros.system.text import percent
 
-#: of each component of an axis that may point anywhere: the root of a third
-UNKNOWN_MOUNT = 0.58
-#: the same of an array, and the error from which axes follow the motion alone
-UNKNOWN_AXES = 0.1
-#: s, samples, and s from one to the next
-LEAST_DURATION, LEAST_SAMPLES, LONGEST_INTERVAL = (
-    10.0,
-    100,
-    1.0,
-)
-#: Scale error of all gyros of a type, which their differences do not show: data sheets of MEMS
-#: gyros state 0.5 to 1.5 %, and calibrations at the works leave less.
-SHARED_SCALE = 0.005
-#: share of its samples that a channel must give
-LEAST_USABLE = 0.3
-#: longest fault, as a share of the recording, for which the others decide
-MOST_FAULTY = 0.35
+
+class UnknownAxes(NamedTuple):
+    """Errors of axes and scales before the recording shows them."""
+
+    #: error of each component of an axis that may point anywhere: the root of a
+    #: third
+    mount: float = 0.58
+    #: the same of an array, and the error from which axes follow the motion alone
+    axes: float = 0.1
+    #: scale error of all gyros of a type, which their differences do not show: data
+    #: sheets of MEMS gyros state 0.5 to 1.5 %, and calibrations at the works leave
+    #: less
+    shared_scale: float = 0.005
+
+
+UNKNOWN_AXES = UnknownAxes()
+
+
+class _NeededData(NamedTuple):
+    """What a recording must have to calibrate with it."""
+
+    #: shortest recording, s
+    duration: float = 10.0
+    #: fewest samples
+    samples: int = 100
+    #: longest time from one sample to the next, s
+    interval: float = 1.0
+    #: share of its samples that a channel must give
+    share: float = 0.3
+    #: longest fault, as a share of the recording, for which the others decide
+    faulty: float = 0.35
+
+
+NEEDED_DATA = _NeededData()
+
 #: smallest imus.max_skew where smaller delays are taken off, s
 LEAST_SKEW = 5e-5
 #: smallest imus.timeout, in differences of unit delays
@@ -107,7 +125,7 @@ class StampDelay(NamedTuple):
     @property
     def shown(self) -> bool:
         """Whether the data show one."""
-        return abs(self.value) > SHOWN_ERRORS * self.error
+        return abs(self.value) > MOUNT_ERRORS.sigmas * self.error
 
 
 class Span(NamedTuple):
@@ -255,7 +273,7 @@ class _Beside:
         self.positions = find_positions(block, config, gyros)
         self.settings = _settings(config, active, step, gyros)
         # The axes of a trusted unit are true.
-        common = config.noise.shared_scale_std or SHARED_SCALE
+        common = config.noise.shared_scale_std or UNKNOWN_AXES.shared_scale
         self.settings["noise.shared_scale_std"] = 0.0 if any(trusted) else common
         self.settings |= position_settings(self.positions, config)
         self.config = config.replaced(self.settings)
@@ -302,12 +320,14 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
     """Refuse a recording that is too short, too slow, or lacks too much of a channel."""
     samples = len(data.stamp)
     words = ""
-    if samples < 2 or data.duration < LEAST_DURATION:
-        words = f"is {data.duration:.1f} s long, a calibration needs at least {LEAST_DURATION:g} s"
-    elif samples < LEAST_SAMPLES:
-        words = f"has {samples} samples, a calibration needs at least {LEAST_SAMPLES}"
-    elif data.step > LONGEST_INTERVAL:
-        words = f"has a sample every {data.step:g} s, a calibration needs one every {LONGEST_INTERVAL:g} s"
+    if samples < 2 or data.duration < NEEDED_DATA.duration:
+        words = f"is {data.duration:.1f} s long, a calibration needs at least {NEEDED_DATA.duration:g} s"
+    elif samples < NEEDED_DATA.samples:
+        words = (
+            f"has {samples} samples, a calibration needs at least {NEEDED_DATA.samples}"
+        )
+    elif data.step > NEEDED_DATA.interval:
+        words = f"has a sample every {data.step:g} s, a calibration needs one every {NEEDED_DATA.interval:g} s"
     if words:
         raise CalibrationError(f"the recording {words}")
     for i, name in enumerate(names):
@@ -315,14 +335,14 @@ def _check_amount(data: Data, names: tuple[str, ...]) -> None:
         # A unit may be slower than others, so its own rate counts.
         usual = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
         share = len(seconds) * usual / (samples * data.step)
-        if share < LEAST_USABLE:
+        if share < NEEDED_DATA.share:
             lost = ", ".join(
                 f"{count[i]} {why.replace('_', ' ')}"
                 for why, count in data.unusable.items()
             )
             raise CalibrationError(
                 f"{name} gives a usable value in {percent(share)} of its samples, expected at least"
-                f" {percent(LEAST_USABLE)}"
+                f" {percent(NEEDED_DATA.share)}"
                 f" ({lost}): mend it or name it in excluded_channels"
             )
 
@@ -369,9 +389,9 @@ def _sensors(
         found = np.linalg.lstsq(x, means, rcond=None)[0].T @ axes[chosen]
         least = np.linalg.eigvalsh(x.T @ x / len(x))[0]
         turns = np.sqrt(least) >= TURNS.least_rotation
-        if turns and np.abs(found - axes).max() > UNKNOWN_AXES:
+        if turns and np.abs(found - axes).max() > UNKNOWN_AXES.axes:
             axes = found
-            scale = np.full(nominal.n, UNKNOWN_AXES)
+            scale = np.full(nominal.n, UNKNOWN_AXES.axes)
     if lost:
         # Directions without rotation stay as configured.
         others = [i for i in range(nominal.n) if i not in lost]
@@ -381,7 +401,7 @@ def _sensors(
         right = rate.T @ means[:, lost] + weak @ axes[lost].T
         axes[lost] = np.linalg.solve(normal, right).T
     scale[chosen] = REFERENCE_STD
-    scale[lost] = UNKNOWN_MOUNT
+    scale[lost] = UNKNOWN_AXES.mount
     # Channels that belong to no unit are of the first.
     units = list(dict.fromkeys(unit for unit in nominal.unit_of if unit)) or [""]
     unit = np.array([units.index(unit) if unit else 0 for unit in nominal.unit_of])
@@ -457,8 +477,8 @@ def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data
         # A fault may have begun 1 s before; most are declared sooner.
         rows = (data.seconds >= span.start - 1.0) & (data.seconds <= span.end)
         z[np.ix_(np.flatnonzero(rows), np.array(span.channels))] = np.nan
-    if share.max() > MOST_FAULTY:
-        group = [names[i] for i in np.flatnonzero(share > MOST_FAULTY)]
+    if share.max() > NEEDED_DATA.faulty:
+        group = [names[i] for i in np.flatnonzero(share > NEEDED_DATA.faulty)]
         first = next(span for span in clear if int(share.argmax()) in span.channels)
         raise DisagreementError(
             f"{' or '.join(group)} disagrees with the others in {percent(share.max())} of the recording (from"
@@ -512,7 +532,7 @@ def _settings(
     if source.stamped:
         total = np.array(source.delays)
         shown = np.abs(found.delay) > np.maximum(
-            LEAST_SKEW, SHOWN_ERRORS * found.delay_std
+            LEAST_SKEW, MOUNT_ERRORS.sigmas * found.delay_std
         )
         # Of all channels of a unit the first is taken.
         units, first = np.unique(
@@ -548,7 +568,7 @@ def _nonlinearity(before: NoiseModel, active: Int, found: StateEstimate) -> Arra
     """
     usual = before.nonlinearity_std[active]
     shown = found.nonlinearity
-    sure = shown.is_measured and shown.value > SHOWN_ERRORS * shown.error
+    sure = shown.is_measured and shown.value > MOUNT_ERRORS.sigmas * shown.error
     return np.maximum(usual, shown.value if sure else 0.0)
 
 

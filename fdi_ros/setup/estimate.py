@@ -20,6 +20,7 @@ stay at their prior.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,14 +66,23 @@ from fdi_ros.setup.smoother import (
 SCALE_STD = 0.008
 #: The same for reference channels, whose axes are taken as configured.
 REFERENCE_STD = 1e-6
-#: Passes over a recording. They end earlier once nothing changes any more.
-MOST_PASSES = 12
-TRUSTING = MOST_PASSES // 3
-"""First passes, which take all motion for motion, because unknown delays and scale
-errors look like vibration.
-"""
-#: change of delays, s, and relative change of axes, below which a pass has settled
-SETTLED_CHANGE = 2e-5
+
+
+class _PassLimits(NamedTuple):
+    """Passes over a recording, and what ends them."""
+
+    #: largest number of passes. They end earlier once nothing changes any more
+    most: int = 12
+    #: first passes, which take all motion for motion, because unknown delays and
+    #: scale errors look like vibration
+    trusting: int = most // 3
+    #: change of delays, s, and relative change of axes, below which a pass has
+    #: settled
+    settled: float = 2e-5
+
+
+_PASSES = _PassLimits()
+
 #: Largest standard error of a delay that counts as known, s, and largest change of a
 #: delay in a pass from which the walk of the biases is found: a tenth of a sample at
 #: 100 Hz.
@@ -208,12 +218,12 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
     moved = np.inf
     blocks = make_blocks(data, taken[sensors.unit])
     walk: RandomWalk | None = None
-    for number in range(MOST_PASSES):
+    for number in range(_PASSES.most):
         one = _Pass(blocks, priors, axes, taken, biases, number > 1, colour)
-        is_last = number == MOST_PASSES - 1
+        is_last = number == _PASSES.most - 1
         if number > 1 and (is_last or (walk is None and moved < SHOWN_DELAY)):
             walk = find_random_walk(one.evidence)
-        shown, found = one.solve(walk, number >= TRUSTING)
+        shown, found = one.solve(walk, number >= _PASSES.trusting)
         scale = found.constant[: 3 * n].reshape(n, 3)
         step = np.clip(found.constant[3 * n : one.motion], -STEP_DELAY, STEP_DELAY)
         axes = axes + scale
@@ -221,13 +231,13 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
         biases = one.curve_of(found)
         colour = one.colours(axes)
         moved = float(np.abs(delay - taken).max())
-        has_settled = moved < SETTLED_CHANGE and np.abs(scale).max() < SETTLED_CHANGE
-        if number > TRUSTING and walk is not None and has_settled:
+        has_settled = moved < _PASSES.settled and np.abs(scale).max() < _PASSES.settled
+        if number > _PASSES.trusting and walk is not None and has_settled:
             break
-        if moved > SETTLED_CHANGE:
+        if moved > _PASSES.settled:
             taken = delay
             blocks = make_blocks(data, taken[sensors.unit])
-        priors = _widened(sensors, axes) if number >= TRUSTING else sensors
+        priors = _widened(sensors, axes) if number >= _PASSES.trusting else sensors
     assert walk is not None
     covariance = _constant_covariance(one, shown, found)
     delay_std = np.append(0.0, np.sqrt(np.diag(covariance)[3 * n : one.motion]))

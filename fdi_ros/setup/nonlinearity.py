@@ -21,11 +21,19 @@ import numpy as np
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.setup.noise import information, projector
 
-#: as data sheets state it, 0.01 to 1 %
-USUAL_NONLINEARITY = 2e-3
-#: largest standard error with which a nonlinearity counts as measured: half of the
-#: usual one
-MEASURED = 1e-3
+
+class _NonlinearityLimits(NamedTuple):
+    """How large a nonlinearity is, and when it counts as measured."""
+
+    #: usual nonlinearity: data sheets state 0.01 to 1 %
+    usual: float = 2e-3
+    #: largest standard error with which it counts as measured: half of the usual
+    #: one
+    error: float = 1e-3
+
+
+_NONLINEARITY = _NonlinearityLimits()
+
 #: signals of a channel: bias, three of scale, drift, asymmetry, odd order
 TERMS = 7
 
@@ -41,7 +49,7 @@ class Nonlinearity(NamedTuple):
     @property
     def is_measured(self) -> bool:
         """Whether the recording shows how large it is."""
-        return self.error < MEASURED
+        return self.error < _NONLINEARITY.error
 
 
 def measure(
@@ -107,7 +115,7 @@ def measure(
     squares = [_mean_square(found[:, k], each[:, k, :, k], axes) for k in (5, 6)]
     value = float(np.sqrt(max(sum(square for square, _ in squares), 0.0)))
     spread = float(np.sqrt(sum(error**2 for _, error in squares)))
-    return Nonlinearity(value, spread / (2.0 * max(value, USUAL_NONLINEARITY)))
+    return Nonlinearity(value, spread / (2.0 * max(value, _NONLINEARITY.usual)))
 
 
 def _mean_square(shares: Array, covariance: Array, axes: Array) -> tuple[float, float]:
@@ -118,6 +126,6 @@ def _mean_square(shares: Array, covariance: Array, axes: Array) -> tuple[float, 
     counts = variance > 1e-6 * variance.max()
     variance = variance[counts]
     along = (directions.T @ shares)[counts]
-    weight = (variance + USUAL_NONLINEARITY**2) ** -2.0
+    weight = (variance + _NONLINEARITY.usual**2) ** -2.0
     square = np.average(along**2 - variance, weights=weight)
     return float(square), float(np.sqrt(2.0 / weight.sum()))

@@ -49,19 +49,28 @@ from fdi_ros.setup.smoother import (
     smooth,
 )
 
-#: of a position before anything is shown, m
-POSITION_STD = 0.5
-#: of the difference of two biases before anything is shown, m/s^2
-BIAS_STD = 1.5
-#: largest standard error of a position that counts as measured, m
-SHOWN_POSITION = 0.01
+
+class _PositionLimits(NamedTuple):
+    """Priors of positions, and limits of measured ones."""
+
+    #: standard deviation of a position before anything is shown, m
+    std: float = 0.5
+    #: standard deviation of the difference of two biases before anything is shown,
+    #: m/s^2
+    bias_std: float = 1.5
+    #: largest standard error of a position that counts as measured, m
+    shown: float = 0.01
+    #: fewest windows of at least `LEAST_BLOCKS` blocks in use
+    windows: int = 5
+    #: angular acceleration over its noise, in power, from which a window turns
+    turning: float = 3.0
+
+
+POSITION_LIMITS = _PositionLimits()
+
 #: weights of a block and its neighbours: the mean force then lasts as long as the
 #: difference of two rates, to second order
 SMOOTHING = np.array([1.0, 4.0, 1.0]) / 6.0
-#: fewest windows of at least `LEAST_BLOCKS` blocks in use
-LEAST_TURNING = 5
-#: angular acceleration over its noise, in power, from which a window turns
-TURNING_POWER = 3.0
 #: Numbers of states: the walking bias; and bias, position (3), scale and mount errors
 #: (9) and delay together.
 BIAS_COUNT, STATE_COUNT = 3, 16
@@ -82,7 +91,7 @@ class Position(NamedTuple):
     @property
     def measured(self) -> Array:
         """Whether the recording shows the position, (3,) along the axes of the body."""
-        return np.asarray(self.error < SHOWN_POSITION)
+        return np.asarray(self.error < POSITION_LIMITS.shown)
 
 
 def find_positions(
@@ -222,7 +231,7 @@ def _windows_of(
     of_noise /= FORCE.natural**2
     power = (signals[:, :, 3:6] ** 2).sum(axis=(1, 2))
     power = np.add.reduceat(power, blocks.start) / np.maximum(count, 1)
-    turns = power > TURNING_POWER * np.trace(of_noise, axis1=1, axis2=2)
+    turns = power > POSITION_LIMITS.turning * np.trace(of_noise, axis1=1, axis2=2)
     signals[:, :, 3:6] *= turns[blocks.window][:, None, None]
     moments = np.add.reduceat(np.einsum("bas,bat->bst", signals, signals), blocks.start)
     moments[:, 3:6, 3:6] -= (count * turns)[:, None, None] * of_noise
@@ -264,12 +273,12 @@ def _position(
     """
     blocks = found.blocks
     evidence = _windows_of(first, other, turning, noise, blocks)
-    if evidence.known.sum() < LEAST_TURNING:
-        return np.zeros(3), np.full(3, POSITION_STD)
+    if evidence.known.sum() < POSITION_LIMITS.windows:
+        return np.zeros(3), np.full(3, POSITION_LIMITS.std)
     prior = np.concatenate(
         [
-            np.full(3, BIAS_STD / FORCE.natural),
-            np.full(3, POSITION_STD),
+            np.full(3, POSITION_LIMITS.bias_std / FORCE.natural),
+            np.full(3, POSITION_LIMITS.std),
             np.full(9, TURNS.square),
             [UNIT_DELAY],
         ]
@@ -300,7 +309,9 @@ def _position(
     value = fitted.constant[:3]
     # No recording shows the scale that all gyros have in common.
     common = SCALE_STD * float(np.linalg.norm(value))
-    error = np.minimum(np.hypot(np.sqrt(np.diag(covariance)), common), POSITION_STD)
+    error = np.minimum(
+        np.hypot(np.sqrt(np.diag(covariance)), common), POSITION_LIMITS.std
+    )
     return value, error
 
 

@@ -53,18 +53,17 @@ from fdi_ros.report.layout import (
     told,
 )
 from fdi_ros.setup.accelerometers import AccelerometerFit
-from fdi_ros.setup.agreement import SHOWN_ERRORS
+from fdi_ros.setup.agreement import MOUNT_ERRORS
 from fdi_ros.setup.blocks import flag_runs
 from fdi_ros.setup.calibrate import Calibration, Span, StampDelay
 from fdi_ros.setup.channels import UNMEASURED, ChannelFit
 from fdi_ros.setup.estimate import SHOWN_DELAY
 from fdi_ros.setup.mounting import fault_sections, pair_lines
-from fdi_ros.setup.positions import SHOWN_POSITION
+from fdi_ros.setup.positions import POSITION_LIMITS
 from fdi_ros.setup.run import (
     FORCE_SIZES,
-    NAMED_WITHIN,
+    PROOF,
     TEST_SIZES,
-    TIMES,
     SetupResult,
     Tried,
     times_words,
@@ -83,22 +82,39 @@ from fdi_ros.system.text import (
 #: uncertainty of the axes along a direction of the body from which they are not well
 #: shown
 SHOWN_AXES = UNMEASURED / 2
-#: part of a recording that supports its noise
-LEAST_SUPPORT = 0.2
-#: of axes against nominal, that are worth a look
-LARGE_ANGLE, LARGE_SCALE = (
-    float(np.radians(5.0)),
-    0.05,
-)
-#: of biases, within a recording and at all, rad/s
-LARGE_SWING, LARGE_BIAS = (
-    float(np.radians(0.03)),
-    0.2,
-)
-#: of the bias of an accelerometer against the others, m/s^2
-LARGE_FORCE = 1.0
-#: size of test faults, rad/s, and the share to be found
-FLOOR, LEAST_NAMED = 0.1, 0.9
+
+
+class _Attention(NamedTuple):
+    """From where a result of the set-up is worth a look."""
+
+    #: part of a recording that supports its noise
+    support: float = 0.2
+    #: angle of axes against nominal, rad
+    angle: float = float(np.radians(5.0))
+    #: scale error against nominal, a share
+    scale: float = 0.05
+    #: move of a bias within a recording, rad/s
+    swing: float = float(np.radians(0.03))
+    #: bias, rad/s
+    bias: float = 0.2
+    #: bias of an accelerometer against the others, m/s^2
+    force: float = 1.0
+
+
+ATTENTION = _Attention()
+
+
+class _TestFaults(NamedTuple):
+    """Faults with which a set-up is tried."""
+
+    #: size of test faults, rad/s
+    size: float = 0.1
+    #: share of them to be found
+    named: float = 0.9
+
+
+TEST_FAULTS = _TestFaults()
+
 CONFIG_HINT = "As written; loaded back, and a monitor was built from it."
 NOISE_HINT = (
     "Standard deviation of one sample, averaged over 5 s, vibration included."
@@ -172,7 +188,7 @@ def _found(result: Calibration, unit: Unit) -> Iterator[Finding]:
             names,
             delay.value,
             delay.error,
-            SHOWN_ERRORS * delay.error,
+            MOUNT_ERRORS.sigmas * delay.error,
         )
 
 
@@ -215,13 +231,23 @@ def _positions(result: Calibration) -> Iterator[Finding]:
         error = float(one.error.max())
         if known.all():
             yield Finding(
-                Role.FOUND, "position", words, [name], error=error, bound=SHOWN_POSITION
+                Role.FOUND,
+                "position",
+                words,
+                [name],
+                error=error,
+                bound=POSITION_LIMITS.shown,
             )
             continue
         words += "; the configured position is kept there. Turn the vehicle back and"
         words += " forth about all axes"
         yield Finding(
-            Role.UNKNOWN, "position", words, [name], error=error, bound=SHOWN_POSITION
+            Role.UNKNOWN,
+            "position",
+            words,
+            [name],
+            error=error,
+            bound=POSITION_LIMITS.shown,
         )
 
 
@@ -249,10 +275,10 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
         words += f" {unit.name}), and noise_std is from the quietest motion. Let the vehicle stand still for 10 s,"
         words += " motors off"
         yield Finding(Role.UNKNOWN, "rest", words, error=common)
-    elif share <= LEAST_SUPPORT:
+    elif share <= ATTENTION.support:
         words = f"noise_std is from the quietest {percent(share)} of the recording: a longer"
         words += " rest gives a better value"
-        yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=LEAST_SUPPORT)
+        yield Finding(Role.UNKNOWN, "rest", words, value=share, bound=ATTENTION.support)
     error = result.axis_errors
     rms = np.std(found.rate, axis=0) * unit.factor
     if unmeasured := ["xyz"[a] for a in range(3) if error[a] > UNMEASURED]:
@@ -374,7 +400,7 @@ def _force_warnings(fit: AccelerometerFit) -> Iterator[Finding]:
         yield Finding(
             Role.WARNING, "accelerometer noise", f"{words} when quietest", who
         )
-    if len(large := np.flatnonzero(np.abs(found.bias) > LARGE_FORCE)):
+    if len(large := np.flatnonzero(np.abs(found.bias) > ATTENTION.force)):
         each = ", ".join(
             f"{fit.names[i]} by {found.bias[i]:+.2f} {name}" for i in large
         )
@@ -385,7 +411,7 @@ def _force_warnings(fit: AccelerometerFit) -> Iterator[Finding]:
             [fit.names[i] for i in large],
             float(np.abs(found.bias).max()),
             None,
-            LARGE_FORCE,
+            ATTENTION.force,
         )
 
 
@@ -502,21 +528,25 @@ def _bounds(result: Calibration, unit: Unit) -> list[_Bound]:
         _Bound(
             "axes rotated from nominal",
             result.angle,
-            LARGE_ANGLE,
+            ATTENTION.angle,
             "{:.1f} deg",
             degrees,
         ),
         _Bound(
             "scale factors differ from nominal",
             result.factor - 1.0,
-            LARGE_SCALE,
+            ATTENTION.scale,
             "{:+.1f} %",
             100.0,
         ),
         _Bound(
-            "biases moved within the recording", swing, LARGE_SWING, rate, unit.factor
+            "biases moved within the recording",
+            swing,
+            ATTENTION.swing,
+            rate,
+            unit.factor,
         ),
-        _Bound("large biases", found.bias, LARGE_BIAS, rate, unit.factor),
+        _Bound("large biases", found.bias, ATTENTION.bias, rate, unit.factor),
     ]
 
 
@@ -682,8 +712,8 @@ def _usable(found: SetupResult, tried: Tried, unit: Unit) -> Finding:
     if not biases:
         return Finding(Role.WORTH, "proof", words, headline="USABLE")
     words += _isolation_words(tried, unit)
-    named, of = tried.isolated[FLOOR]
-    if named < LEAST_NAMED * of:
+    named, of = tried.isolated[TEST_FAULTS.size]
+    if named < TEST_FAULTS.named * of:
         return Finding(
             Role.WARNING,
             "proof",
@@ -691,7 +721,7 @@ def _usable(found: SetupResult, tried: Tried, unit: Unit) -> Finding:
             (),
             named,
             None,
-            LEAST_NAMED * of,
+            TEST_FAULTS.named * of,
             "USABLE FOR LARGE FAULTS ONLY",
             "reduce vibration, or record again with rest and turns about every axis",
         )
@@ -699,22 +729,22 @@ def _usable(found: SetupResult, tried: Tried, unit: Unit) -> Finding:
 
 
 def _isolation_words(tried: Tried, unit: Unit) -> str:
-    """Return how many test faults were isolated, and what to expect if few of `FLOOR` were."""
+    """Return how many test faults were isolated, and what to expect if few of `TEST_FAULTS.size` were."""
     isolated, biases = tried.isolated_of
     if not biases:
         return ""
-    sizes = (TEST_SIZES[0], FLOOR, TEST_SIZES[-1])
+    sizes = (TEST_SIZES[0], TEST_FAULTS.size, TEST_SIZES[-1])
     low, floor, high = (f"{size * unit.factor:.3g}" for size in sizes)
     words = f" Of {biases} test faults added there ({low} to {high} {unit.name}),"
     if not isolated:
         return f"{words} none was isolated: a faulty gyro may be detected without being identified."
     words += f" {isolated} were isolated."
-    named, of = tried.isolated[FLOOR]
-    if named >= LEAST_NAMED * of:
+    named, of = tried.isolated[TEST_FAULTS.size]
+    if named >= TEST_FAULTS.named * of:
         return words
     words += f" Of {of} with {floor} {unit.name}, {named} were isolated"
     largest, among = tried.isolated[TEST_SIZES[-1]]
-    if largest >= LEAST_NAMED * among:
+    if largest >= TEST_FAULTS.named * among:
         return f"{words}: expect to identify the faulty gyro only of larger faults."
     words += (
         f", and of {among} with {high} {unit.name}, {largest}: a faulty gyro may be"
@@ -1020,7 +1050,7 @@ def _sections(
     result = found.calibration
     first = verdict_of(findings)
     hint = f"Replays of {proof.source}: one has no fault. In each of the others a bias begins on one channel,"
-    hint += f" at one of {TIMES} moments. Isolated: that channel alone is declared within {NAMED_WITHIN:g} s."
+    hint += f" at one of {PROOF.times} moments. Isolated: that channel alone is declared within {PROOF.within:g} s."
     bag = shlex.quote(bag)
     config = shlex.quote(config)
     is_bad = first.severity is Severity.BAD

@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,9 +53,9 @@ from fdi_ros.replay.sweep import (
 from fdi_ros.setup.agreement import Mount, find_mounts
 from fdi_ros.setup.blocks import prepare
 from fdi_ros.setup.calibrate import (
-    LEAST_DURATION,
+    NEEDED_DATA,
     REPLACED,
-    UNKNOWN_MOUNT,
+    UNKNOWN_AXES,
     Calibration,
     calibrate,
     reference_channels,
@@ -65,24 +66,33 @@ from fdi_ros.system.text import first_of, percent, shown
 #: biases of gyros tried, rad/s, and of accelerometers, m/s^2
 TEST_SIZES = (0.03, 0.1, 0.3)
 FORCE_SIZES = (0.3, 1.0, 3.0)
-#: size from which on biases of accelerometers count in a comparison, m/s^2: healthy ones
-#: move by 0.6 m/s^2 as vibration begins or ends
-FORCE_FLOOR = 1.0
-#: s in which they are to be isolated, and how often each is tried
-NAMED_WITHIN, TIMES = (
-    4.0,
-    2,
-)
-#: fewer biases isolated than before that are chance: one at the edge of `NAMED_WITHIN`
-CHANCE = 1
-#: part kept aside, and its bounds, s: all biases have room
-KEPT_ASIDE, LEAST_KEPT, MOST_KEPT = (
-    0.25,
-    TIMES * NAMED_WITHIN,
-    120.0,
-)
+
+
+class _Proof(NamedTuple):
+    """How a set-up is proved on a part kept aside."""
+
+    #: size from which on biases of accelerometers count in a comparison, m/s^2:
+    #: healthy ones move by 0.6 m/s^2 as vibration begins or ends
+    force_floor: float = 1.0
+    #: time in which biases are to be isolated, s
+    within: float = 4.0
+    #: how often each bias is tried
+    times: int = 2
+    #: fewer biases isolated than before that are chance: one at the edge of
+    #: `within`
+    chance: int = 1
+    #: part kept aside
+    share: float = 0.25
+    #: shortest part kept aside, s: all biases have room
+    least: float = times * within
+    #: longest part kept aside, s
+    most: float = 120.0
+
+
+PROOF = _Proof()
+
 #: s that must be left to calibrate on
-LEAST_LEFT = 2 * LEAST_DURATION
+LEAST_LEFT = 2 * NEEDED_DATA.duration
 
 
 @dataclass
@@ -112,7 +122,9 @@ class Tried:
             if event.reason == Reason.STUCK.value:
                 self.stuck.setdefault(event.channel, event.at_s)
         self.isolated_of = _of_all_sizes(self.isolated)
-        large = {size: n for size, n in self.forces.items() if size >= FORCE_FLOOR}
+        large = {
+            size: n for size, n in self.forces.items() if size >= PROOF.force_floor
+        }
         self.forces_of = _of_all_sizes(large)
 
 
@@ -164,7 +176,7 @@ class Proof:
         if before.judged - after.judged > 0.02:
             words = f"the new settings judge {percent(after.judged)} of the samples"
             return f"{words} instead of {percent(before.judged)}"
-        if tried_before == tried and was - now > CHANCE:
+        if tried_before == tried and was - now > PROOF.chance:
             return f"the new settings isolate {now} of {tried} biases instead of {was}"
         return ""
 
@@ -173,10 +185,10 @@ class Proof:
         """Words for fewer biases of accelerometers isolated than before, or empty."""
         was, tried_before = self.before.forces_of
         now, tried = self.after.forces_of
-        if tried_before != tried or was - now <= CHANCE:
+        if tried_before != tried or was - now <= PROOF.chance:
             return ""
         words = f"the new settings isolate {now} of {tried} biases of accelerometers of"
-        return f"{words} {FORCE_FLOOR:g} m/s^2 or more instead of {was}"
+        return f"{words} {PROOF.force_floor:g} m/s^2 or more instead of {was}"
 
 
 def _tried(block: Block, config: Config, start: float) -> Tried:
@@ -187,7 +199,9 @@ def _tried(block: Block, config: Config, start: float) -> Tried:
     faults = [f"kind=bias size={size:g}" for size in TEST_SIZES]
     faults += [f"channel={FORCES} kind=bias size={size:g}" for size in FORCE_SIZES]
     plan = Plan(
-        tuple(one for text in faults for one in parse_swept(text)), TIMES, NAMED_WITHIN
+        tuple(one for text in faults for one in parse_swept(text)),
+        PROOF.times,
+        PROOF.within,
     )
     one = Subject("settings", config, block, start=start)
     try:
@@ -420,7 +434,7 @@ def _kept_from(block: Block) -> tuple[float, float] | None:
         return None
     steps = np.diff(block.stamp) * 1e-9
     lasts = np.cumsum(np.minimum(steps, INTERVALS.gap * np.median(steps)))
-    kept = float(np.clip(KEPT_ASIDE * lasts[-1], LEAST_KEPT, MOST_KEPT))
+    kept = float(np.clip(PROOF.share * lasts[-1], PROOF.least, PROOF.most))
     if lasts[-1] - kept < LEAST_LEFT:
         return None
     return float(np.cumsum(steps)[np.searchsorted(lasts, lasts[-1] - kept)]), kept
@@ -531,7 +545,7 @@ def _with_mounts(
         return found
     # Nothing may be declared because of mounts that nobody knows.
     careful = _if_built(
-        {**before.parameters, "noise.scale_std": [UNKNOWN_MOUNT]}, before
+        {**before.parameters, "noise.scale_std": [UNKNOWN_AXES.mount]}, before
     )
     who = f"{' and '.join(names[k] for k in lost)} {'is' if len(lost) == 1 else 'are'}"
     why = CalibrationError(

@@ -21,13 +21,22 @@ from fdi_ros.model.samples import Array
 
 #: tried, rad/s/sqrt(s)
 WALKS = np.geomspace(1e-6, 4e-3, 13)
-#: smallest walk, rad/s/sqrt(s), which moves no bias and keeps the system regular
-NO_WALK = 1e-7
-#: log-likelihood that a walk must gain over none to be shown: one of 200 without a walk
-#: does
-SHOWN_GAIN = 4.0
-#: loss of log-likelihood for a possible walk, exceeded by one true walk in 20
-POSSIBLE = 2.0
+
+
+class _WalkEvidence(NamedTuple):
+    """How the walk of the biases is found."""
+
+    #: smallest walk, rad/s/sqrt(s), which moves no bias and keeps the system
+    #: regular
+    none: float = 1e-7
+    #: log-likelihood that a walk must gain over none to be shown: one of 200
+    #: without a walk does
+    gain: float = 4.0
+    #: loss of log-likelihood for a possible walk, exceeded by one true walk in 20
+    possible: float = 2.0
+
+
+_WALK = _WalkEvidence()
 
 
 class NormalEquations:
@@ -100,7 +109,7 @@ def _eliminate(of: NormalEquations, walk: float) -> tuple[Array, Array, Array, f
     """
     n = of.n
     count = len(of.normal)
-    stiffness = of.prior[0] ** 2 / (max(walk, NO_WALK) ** 2 * of.apart[:-1])[:, None]
+    stiffness = of.prior[0] ** 2 / (max(walk, _WALK.none) ** 2 * of.apart[:-1])[:, None]
     blocks = of.normal[:, :n, :n].copy()
     diagonal = np.einsum("kii->ki", blocks)
     diagonal[0] += 1.0
@@ -149,9 +158,9 @@ def find_random_walk(of: NormalEquations) -> RandomWalk:
         curvature = min(a - 2 * b + c, -1e-9)
         shift = float(np.clip(0.5 * (a - c) / curvature, -0.5, 0.5))
     value = float(WALKS[best] * (WALKS[1] / WALKS[0]) ** shift)
-    likely = np.array(logs) > max(logs[best], none) - POSSIBLE
+    likely = np.array(logs) > max(logs[best], none) - _WALK.possible
     possible = float(WALKS[likely].max(initial=0.0))
-    return RandomWalk(value if logs[best] - none > SHOWN_GAIN else 0.0, possible)
+    return RandomWalk(value if logs[best] - none > _WALK.gain else 0.0, possible)
 
 
 def smooth(
