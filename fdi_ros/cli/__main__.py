@@ -15,7 +15,7 @@ import sys
 import time
 from types import FrameType
 
-from fdi_ros.cli import STOPPED
+from fdi_ros.cli import ExitCode
 from fdi_ros.signals import heeded
 
 SIGNAL_PATIENCE = 2.0
@@ -39,7 +39,7 @@ class Stop:
         if not self.running or (
             self.asked is not None and now - self.asked > SIGNAL_PATIENCE
         ):
-            os._exit(STOPPED)
+            os._exit(ExitCode.STOPPED)
         if self.asked is None:
             self.asked = now
             raise KeyboardInterrupt
@@ -66,7 +66,7 @@ def fdi() -> int:
         stop.running = True
         return main(stopped=lambda: stop.asked is not None)
     except KeyboardInterrupt:
-        return STOPPED
+        return ExitCode.STOPPED
     finally:
         for number in stopping:
             # At exit Python restores the original handlers, but keeps ignored signals ignored.

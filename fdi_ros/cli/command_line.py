@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from fdi_ros import __version__
-from fdi_ros.cli import STOPPED
+from fdi_ros.cli import ExitCode
 from fdi_ros.detectors import DETECTORS
 from fdi_ros.errors import FdiError
 from fdi_ros.system import BAGS, POOL, PROGRESS, require, resolve, shipped_files
@@ -440,12 +440,11 @@ FIRST = ("inspect", "setup", "replay", "watch")
 
 # A run
 
-DEFECT = 70
-"""Exit code for a defect of fdi: EX_SOFTWARE of sysexits.h."""
 EXIT_CODES = (
     "Exit codes: 0 done, and the verdict is good; 1 a replay does not meet its --check; 2 wrong arguments or input"
     " (one line on standard error); 3 a verdict that needs action; 4 a verdict that leaves a question open;"
-    f" {DEFECT} a defect of fdi itself (please report the traceback); {STOPPED} stopped by a signal."
+    f" {ExitCode.DEFECT:d} a defect of fdi itself (please report the traceback);"
+    f" {ExitCode.STOPPED:d} stopped by a signal."
 )
 
 
@@ -475,13 +474,13 @@ def main(
             _let_go_of_output()
         raise
     except KeyboardInterrupt:
-        return STOPPED
+        return ExitCode.STOPPED
     except BrokenPipeError:
         # The reader of the output has gone (fdi ... | head): no error, and no output at exit.
         _let_go_of_output()
-        return 0
+        return ExitCode.DONE
     except Exception as error:
-        return STOPPED if stopped() else _failure(error)
+        return ExitCode.STOPPED if stopped() else _failure(error)
 
 
 def _run(argv: Sequence[str] | None) -> int:
@@ -491,7 +490,7 @@ def _run(argv: Sequence[str] | None) -> int:
     _refuse(parser, given.verb, unknown)
     if given.verb is None:
         parser.print_help()
-        return 0
+        return ExitCode.DONE
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             # Escape characters that the terminal cannot show.
@@ -542,7 +541,7 @@ def _failure(error: Exception) -> int:
                 " lines above to the maintainers named in its package.xml",
                 file=sys.stderr,
             )
-        return DEFECT
+        return ExitCode.DEFECT
     try:
         sys.stdout.flush()
     except OSError:
@@ -550,7 +549,7 @@ def _failure(error: Exception) -> int:
     with contextlib.suppress(OSError):
         # An error quotes its input, which may be hostile.
         print(f"fdi: {shown(words, LINE)}", file=sys.stderr)
-    return 2
+    return ExitCode.REFUSED
 
 
 def _let_go_of_output() -> None:
@@ -611,7 +610,7 @@ class _PrintCompletion(argparse.Action):
         try:
             require("--print-completion", ("shtab",))
         except FdiError as error:
-            parser.exit(2, f"fdi: {error}\n")
+            parser.exit(ExitCode.REFUSED, f"fdi: {error}\n")
         import shtab
 
         if values not in shtab.SUPPORTED_SHELLS:

@@ -22,6 +22,7 @@ import numpy as np
 
 from fdi_ros import __version__
 from fdi_ros.bag.raw import Damage, find_files, is_made_by_fdi
+from fdi_ros.cli import ExitCode
 from fdi_ros.compiling.notice import clock, compiling_seconds, is_compiling
 from fdi_ros.errors import BagError, ConfigError
 from fdi_ros.report.layout import Severity
@@ -285,7 +286,7 @@ class Outputs:
                 )
                 warning = " (NOT FOR FLIGHT)" if refused else ""
                 self.say(f"wrote {shown(target, LINE)}{warning}\n")
-        return 0 if severity is None else severity.exit_code
+        return ExitCode.DONE if severity is None else severity.exit_code
 
 
 def config_words(arguments: argparse.Namespace) -> str:

@@ -13,6 +13,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from fdi_ros.cli import ExitCode
 from fdi_ros.cli.outputs import (
     Kind,
     Outputs,
@@ -89,7 +90,7 @@ def run_replay(arguments: Namespace) -> int:
     if arguments.check is not None:
         return _report_check(arguments, outputs, summary, unmet)
     # With injected faults the verdict is on the monitor, not on the gyros.
-    return 0 if task.faults else worst.exit_code
+    return ExitCode.DONE if task.faults else worst.exit_code
 
 
 def _replay_task(arguments: Namespace) -> _Task:
@@ -224,7 +225,7 @@ def _report_check(
         print(f"fdi: check not met: {line}", file=sys.stderr)
     if not unmet:
         outputs.say(f"check met: {arguments.check}\n")
-    return 1 if unmet else 0
+    return ExitCode.UNMET if unmet else ExitCode.DONE
 
 
 def _sinks(arguments: Namespace, config: Config, stack: ExitStack) -> list[Sink]:

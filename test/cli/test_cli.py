@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 from bag import logs
 
-from fdi_ros.cli import command_line
+from fdi_ros.cli import ExitCode, command_line
 from fdi_ros.cli.command_line import main
 from fdi_ros.cli.outputs import progress
 from fdi_ros.cli.settings import compile_now, warm_detector, warm_path
@@ -688,7 +688,7 @@ def test_a_replay_that_is_stopped_leaves_nothing_behind(flight, config, tmp_path
 
 NO_COMPILER = """
 import sys
-from fdi_ros.cli import command_line
+from fdi_ros.cli import ExitCode, command_line
 for words in ("--help", "--version", "replay", "compile --help", "fly", "inspect --no", "replay --help"):
     if words == "replay --help":
         # It lists the kinds of faults.
@@ -851,11 +851,11 @@ def test_only_a_former_result_is_replaced_and_nothing_else_is_touched(
 def test_a_defect_of_ours_is_told_from_a_check_that_is_not_met(fdi, monkeypatch):
     monkeypatch.setattr("fdi_ros.cli.settings.shipped_files", lambda: 1 / 0)
     code, out, err = fdi("shipped")
-    assert (code, out) == (command_line.DEFECT, "")
+    assert (code, out) == (ExitCode.DEFECT, "")
     assert err.startswith("Traceback")
     assert "ZeroDivisionError" in err
     assert err.splitlines()[-1].startswith("fdi: this is a defect of fdi")
-    assert f"{command_line.DEFECT} a defect" in command_line.EXIT_CODES
+    assert f"{ExitCode.DEFECT:d} a defect" in command_line.EXIT_CODES
 
 
 class Terminal(io.StringIO):
