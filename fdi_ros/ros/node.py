@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -44,29 +44,42 @@ from fdi_ros.monitor.diagnostics import DIAGNOSTICS, Level, StatusLine
 from fdi_ros.ros.process import Stop, spin
 from fdi_ros.system.text import LINE, shown
 
-DEPTH = 256  # messages that a topic keeps, in and out, for a busy node: a quarter of a second at 1 kHz
+
+class _Load(NamedTuple):
+    """How much a busy node takes."""
+
+    #: messages that a topic keeps, in and out: a quarter of a second at 1 kHz
+    depth: int = 256
+    #: longest turn, s: reports and requests do not wait for a flood
+    turn: float = 0.05
+    #: events that may wait in the queue of an executor: some 50 ms of its work, 1
+    #: MB
+    flood: int = 5000
+    #: time after the start of a flood before the first check for its end, s
+    flood_time: float = 5.0
+    #: parameters in one request: several times what any node has
+    parameters: int = 256
+    #: longest queue that may be asked for, messages: 100 s at 1 kHz
+    max_depth: int = 100_000
+
+
+LOAD = _Load()
+
 REPORT_PERIOD = 1.0  # from one regular report of a node to the next, s
 # Most lines of the log of one severity in a `REPORT_PERIOD`: lines that anybody can
 # cause with requests must not hide a declaration.
 MOST_LINES = 20
-LONGEST_TURN = 0.05  # longest turn, s: reports and requests do not wait for a flood
-FLOOD = 5000  # events that may wait in the queue of an executor: some 50 ms of its work, 1 MB
-# time after the start of a flood before the first check for its end, s
-FLOOD_TIME = 5.0
 SETTABLE = range(ParameterType.PARAMETER_BOOL, ParameterType.PARAMETER_STRING_ARRAY + 1)
 """Types that a parameter can be set to.
 
 PARAMETER_NOT_SET is absent, because no parameter can be deleted.
 """
-MOST_PARAMETERS = 256  # in one request: several times what any node has
 OVERRIDABLE = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
 _POLICIES = {
     "history": ("keep_last", "keep_all", "system_default"),
     "depth": (),
     "reliability": ("reliable", "best_effort", "system_default"),
 }  # QoS policies that may be overridden, and their values
-# of a queue: 100 s at 1 kHz
-_MAX_DEPTH = 100_000
 
 
 def message_class(name: str) -> Any:
@@ -197,7 +210,7 @@ class InputQueue:
                 take(data)
 
         # A new QoS each time, as rclpy writes overrides into the object.
-        qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        qos = QoSProfile(depth=LOAD.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
         message = message_class(kind)
         subscription = self._node.create_subscription(
             message, topic, take_event, qos, raw=True, **OVERRIDABLE
@@ -213,10 +226,10 @@ class InputQueue:
         self._waiting = 0
 
     def drain(self) -> None:
-        """Take waiting messages in the order of their arrival, for `LONGEST_TURN` or two full queues at most."""
+        """Take waiting messages in the order of their arrival, for `LOAD.turn` or two full queues at most."""
         takers = list(self.subscriptions.items())
         taken = 0
-        end = time.monotonic() + LONGEST_TURN
+        end = time.monotonic() + LOAD.turn
         heads = [_next(one) for one, _ in takers]
         while waiting := [
             (head[0], k, head[1]) for k, head in enumerate(heads) if head is not None
@@ -225,7 +238,7 @@ class InputQueue:
             subscription, take = takers[k]
             heads[k] = (
                 _next(subscription)
-                if taken < 2 * DEPTH and time.monotonic() < end
+                if taken < 2 * LOAD.depth and time.monotonic() < end
                 else None
             )
             taken += 1
@@ -239,9 +252,9 @@ class InputQueue:
             # The turn has used up the event of a message that was drained, or was a timer's.
             self._waiting -= 1
         self._taken, now = 0, time.monotonic()
-        if not self.flooded and self._waiting > FLOOD:
+        if not self.flooded and self._waiting > LOAD.flood:
             self.flooded = True
-            self._until = now + FLOOD_TIME
+            self._until = now + LOAD.flood_time
             words = "flooded with messages: inputs are polled while it lasts"
             self._node.get_logger().warning(words, throttle_duration_sec=10.0)
         elif self.flooded and now >= self._until:
@@ -362,7 +375,7 @@ class CheckedNode(Node):
         """Publish messages, given as bytes, as REP-2003 wants sensor data: reliable, for subscribers of either kind."""
         # A new QoS each time, as rclpy writes overrides into the object.
         return self.create_publisher(
-            message_class(kind), topic, QoSProfile(depth=DEPTH), **options
+            message_class(kind), topic, QoSProfile(depth=LOAD.depth), **options
         )
 
     def create_diagnostics(self) -> Any:
@@ -408,9 +421,11 @@ class CheckedNode(Node):
                 raise ConfigError(
                     f"{name} is {value!r}, expected one of: {', '.join(choices)}"
                 )
-            if not choices and (type(value) is not int or not 1 <= value <= _MAX_DEPTH):
+            if not choices and (
+                type(value) is not int or not 1 <= value <= LOAD.max_depth
+            ):
                 raise ConfigError(
-                    f"{name} is {value!r}, expected a whole number, 1 to {_MAX_DEPTH}"
+                    f"{name} is {value!r}, expected a whole number, 1 to {LOAD.max_depth}"
                 )
 
     # Requests -------------------------------------------------------------------------
@@ -473,8 +488,8 @@ class CheckedNode(Node):
         together = isinstance(request, SetParametersAtomically.Request)
         for k, messages in enumerate([given] if together else [[one] for one in given]):
             self.keep_up()
-            many = k + len(messages) > MOST_PARAMETERS
-            words = f"{len(given)} parameters in one request, expected at most {MOST_PARAMETERS}"
+            many = k + len(messages) > LOAD.parameters
+            words = f"{len(given)} parameters in one request, expected at most {LOAD.parameters}"
             results.append(_refusal(words) if many else self._set(messages))
         if together:
             response.result = results[0]

@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -29,13 +29,24 @@ from fdi_ros.errors import BagError
 from fdi_ros.ros.node import CheckedNode
 from fdi_ros.ros.process import Stop, guarded
 
-PATIENCE = 0.1  # a request, or a signal, waits at most this long for its answer, s
-LONGEST_STEP, DISORDER = (
-    60.0,
-    1.0,
-)  # longest pause that is played, and largest disorder of messages, s
-MOST_BEHIND = 0.01  # largest delay of a message, s: messages due meanwhile fit into a queue at 10 kHz
-CLOCK_STEP = 1_000_000  # /clock is published at most this often, ns of recorded time
+
+class _Pace(NamedTuple):
+    """How closely the player keeps to the recorded times."""
+
+    #: a request, or a signal, waits at most this long for its answer, s
+    patience: float = 0.1
+    #: longest pause that is played, s
+    longest_step: float = 60.0
+    #: largest disorder of messages, s
+    disorder: float = 1.0
+    #: largest delay of a message, s: messages due meanwhile fit into a queue at 10
+    #: kHz
+    behind: float = 0.01
+    #: /clock is published at most this often, ns of recorded time
+    clock_step: int = 1_000_000
+
+
+PACE = _Pace()
 
 
 class PlayerNode(CheckedNode):
@@ -126,9 +137,11 @@ class PlayerNode(CheckedNode):
                 paused = self._paused
                 # What was late, as a chunk was read, is not made up for in a burst that
                 # no queue holds.
-                start += max(0.0, -ahead - MOST_BEHIND)
-                if paused or ahead > 0 or now - answered > PATIENCE:
-                    spin(PATIENCE if paused else min(max(ahead, 0.0), PATIENCE))
+                start += max(0.0, -ahead - PACE.behind)
+                if paused or ahead > 0 or now - answered > PACE.patience:
+                    spin(
+                        PACE.patience if paused else min(max(ahead, 0.0), PACE.patience)
+                    )
                     answered = time.monotonic()
                     # Pauses do not count either.
                     start += answered - now if paused else 0.0
@@ -159,7 +172,7 @@ class PlayerNode(CheckedNode):
             for k in np.argsort(batch.log_time, kind="stable").tolist():
                 now = int(batch.log_time[k])
                 step = 0.0 if last is None else (now - last) / 1e9
-                if -DISORDER < step < LONGEST_STEP:
+                if -PACE.disorder < step < PACE.longest_step:
                     due += step
                 else:
                     clock = None
@@ -169,7 +182,7 @@ class PlayerNode(CheckedNode):
                 last = now
                 yield due
                 if self._clock_output is not None and (
-                    clock is None or now - clock >= CLOCK_STEP
+                    clock is None or now - clock >= PACE.clock_step
                 ):
                     clock = now
                     if not 0 <= now <= LAST_STAMP:

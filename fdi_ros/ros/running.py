@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,12 +52,25 @@ from fdi_ros.ros.node import OVERRIDABLE, REPORT_PERIOD, BoundedLog, CheckedNode
 from fdi_ros.system.text import LINE, figures, shown
 
 MAX_AT_ONCE = 20  # reports of changes between two regular reports: a fault that flickers at 1 kHz must cause no flood
-LATE_SAMPLE = 0.5
-"""Age from which the newest judged sample is reported, s: several times the time that the slowest link and the
-alignment take. A starved computer, or clocks that differ, look like this."""
-ARRIVES = 0.1  # messages arrive if the last one is younger than this, two checks, s
+
+
+class _ReportTimes(NamedTuple):
+    """Ages of messages and of lines from which on something is reported, s."""
+
+    #: age from which the newest judged sample is reported: several times the time
+    #: that the slowest link and the alignment take. A starved computer, or clocks
+    #: that differ, look like this
+    late_sample: float = 0.5
+    #: messages arrive if the last one is younger than this, two checks
+    arrives: float = 0.1
+    #: after a line about a channel, time until the next one unless its state gets
+    #: worse
+    quiet: float = 5.0
+
+
+REPORT_TIMES = _ReportTimes()
+
 NAMED = 4  # publishers of one topic that are named at most
-QUIET = 5.0  # after a line about a channel, time until the next one unless its state gets worse, s
 BY_SEVERITY = (
     "OK",
     "EXCLUDED",
@@ -144,7 +158,7 @@ class ChangeLog:
 
     def _write(self, state: ChannelState, channels: Sequence[int], words: str) -> None:
         for channel in channels:
-            self._last[channel] = _Line(state, self._clock() + QUIET)
+            self._last[channel] = _Line(state, self._clock() + REPORT_TIMES.quiet)
         line = f"{', '.join(self._names[channel] for channel in channels)}: {words}"
         if state.name in BY_SEVERITY[-3:]:
             self._log.error(line)
@@ -200,7 +214,7 @@ class InputTopic:
             rate=watchdog.rate,
             silent=watchdog.seconds(now) if received else None,
             live=receiver.alignment.is_live(self._number) and not watchdog.silent,
-            arrives=watchdog.seconds(now) < ARRIVES,
+            arrives=watchdog.seconds(now) < REPORT_TIMES.arrives,
             lag=max(lag, 0) / 1e9,
             max_lag=receiver.source.max_lag,
             offset=None if stamp == NO_STAMP else (watchdog.at - stamp) / 1e9,
@@ -468,7 +482,7 @@ class Running:
     def _warnings(self, status: Status, clock: int) -> tuple[str, str, str]:
         """Return warnings about the whole at a clock time, ns: sample rate, clock, age of the samples."""
         age = self._age(status, clock)
-        old = LATE_SAMPLE < age <= OLD and not self._has_no_samples
+        old = REPORT_TIMES.late_sample < age <= OLD and not self._has_no_samples
         return (
             self._rate_check.words,
             self._clock_words(),

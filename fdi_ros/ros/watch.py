@@ -49,17 +49,40 @@ try:
 except ImportError:
     CAN_DRAW = False
 
-DRAWING_PERIOD = 0.1  # how often the view is drawn, s
-REGULAR = 10.0  # line by line, the state of the whole is reported at least so often, s
+
+class _WatchTimes(NamedTuple):
+    """When something is shown, s."""
+
+    #: how often the view is drawn
+    drawing: float = 0.1
+    #: line by line, the state of the whole is reported at least so often
+    regular: float = 10.0
+    #: monitors appear one by one: time until one counts as the only one
+    settle: float = 1.0
+
+
+WATCH_TIMES = _WatchTimes()
+
 SERVICE = "/relearn_bias"  # a monitor has this service, before the node is configured
-SETTLE = 1.0  # monitors appear one by one: time until one counts as the only one, s
 STATE_NAMES = {state.name for state in ChannelState}
 DEEP = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 SILENT_AFTER = {
     "fused": 1.0,
     "diagnostics": 3.0,
 }  # age from which a message is no longer shown, s
-KEPT_CHANGES = 50  # changes of state that were not reported yet, or may be drawn
+
+
+class _ChangesRoom(NamedTuple):
+    """How many changes of state are stored and drawn."""
+
+    #: changes of state that were not reported yet, or may be drawn
+    kept: int = 50
+    #: changes of state that are drawn
+    shown: int = 8
+
+
+CHANGES = _ChangesRoom()
+
 COLOURS = {
     Level.OK: "green",
     Level.WARN: "yellow",
@@ -69,7 +92,6 @@ COLOURS = {
 GREY = "bright_black"
 SCALES = tuple(digit * 10.0**power for power in range(-2, 3) for digit in (2, 5, 10))
 """Ends of a residual bar, in the unit of the channel. The least is above the noise of healthy channels."""
-SHOWN_CHANGES = 8  # changes of state that are drawn
 WIDE = 90  # columns from which the biases have room
 
 
@@ -109,7 +131,7 @@ class Picture:
     #: when the last message of each kind came, s, monotonic clock
     heard: dict[str, float] = field(default_factory=dict)
     #: the last changes of state, the newest last
-    changes: deque[Change] = field(default_factory=lambda: deque(maxlen=KEPT_CHANGES))
+    changes: deque[Change] = field(default_factory=lambda: deque(maxlen=CHANGES.kept))
 
     def is_silent(self, kind: str) -> bool:
         """Whether messages of a kind have stopped, or never came."""
@@ -184,7 +206,7 @@ class Watcher(Node):
         )
         now = time.monotonic()
         self._found = min(self._found, now) if there else math.inf
-        if not there or now - self._found < SETTLE:
+        if not there or now - self._found < WATCH_TIMES.settle:
             return ""
         if len(there) > 1:
             names = shown(", ".join(there), LINE)
@@ -309,7 +331,7 @@ def show(
     with showing as show_once:
         while not is_over:
             watcher.look()
-            end = time.monotonic() + DRAWING_PERIOD
+            end = time.monotonic() + WATCH_TIMES.drawing
             while (left := end - time.monotonic()) > 0:
                 executor.spin_once(timeout_sec=left)
             is_over = over()
@@ -344,7 +366,7 @@ class LineReport:
         lines += [(change.at, change.words) for change in picture.changes]
         picture.changes.clear()
         if whole and (whole != before or now >= self._due):
-            self._due = now + REGULAR
+            self._due = now + WATCH_TIMES.regular
             lines.append(
                 (
                     now,
@@ -416,7 +438,7 @@ def draw(picture: Picture, width: int) -> Group:
         *_input_lines(picture),
         Text(),
     ]
-    for change in list(picture.changes)[: -SHOWN_CHANGES - 1 : -1]:
+    for change in list(picture.changes)[: -CHANGES.shown - 1 : -1]:
         at = Text(time.strftime("%H:%M:%S  ", time.localtime(change.at)), style=GREY)
         parts.append(at.append(change.words, style=COLOURS[change.level]))
     return Group(*parts)

@@ -39,7 +39,7 @@ from sensor_msgs.msg import Imu
 
 from fdi_ros.core.messages import ImuTemplate
 from fdi_ros.monitor.output import ChannelState
-from fdi_ros.ros.node import FLOOD_TIME, MOST_PARAMETERS
+from fdi_ros.ros.node import LOAD
 
 FAULTY = int(ChannelState.FAULTY)
 DECLARED = (FAULTY, int(ChannelState.AMBIGUOUS))
@@ -294,7 +294,7 @@ def test_in_a_flood_inputs_are_polled_and_all_else_goes_on(node, listener) -> No
     assert listener.settle()
     assert node[1].memory() < 400
     # And so it is when it is over.
-    time.sleep(FLOOD_TIME)
+    time.sleep(LOAD.flood_time)
     assert listener.trigger("reset").success
     assert listener.settle()
 
@@ -414,7 +414,7 @@ def test_what_cannot_be_set_is_refused_in_the_answer_one_by_one(node, listener) 
         ParameterMessage(name="", value=value(3)),
         ParameterMessage(name="x" * 10**6, value=value(4)),
     ]
-    results = ask(changes[:MOST_PARAMETERS])
+    results = ask(changes[: LOAD.parameters])
     # 3 is PARAMETER_DOUBLE; 2, a whole number, does for it.
     assert [k for k, result in enumerate(results) if result.successful] == [2, 3]
     assert "has type 200, expected a name and a type of 1 to 9" in results[200].reason
@@ -423,7 +423,7 @@ def test_what_cannot_be_set_is_refused_in_the_answer_one_by_one(node, listener) 
     )
     results = ask(changes + odd)
     assert len(results) == 258
-    assert f"expected at most {MOST_PARAMETERS}" in results[-1].reason
+    assert f"expected at most {LOAD.parameters}" in results[-1].reason
     mixed = {"parameters": [changes[3], changes[200]]}
     result = listener.call(
         SetParametersAtomically, "fdi_node/set_parameters_atomically", **mixed

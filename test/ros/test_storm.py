@@ -17,7 +17,7 @@ from ros.storm import KINDS, vehicle, weather
 from fdi_ros.monitor.output import ChannelState, Event, Reason
 from fdi_ros.monitor.status import ApartStatus
 from fdi_ros.ros.node import MOST_LINES, REPORT_PERIOD, BoundedLog
-from fdi_ros.ros.running import QUIET, ChangeLog
+from fdi_ros.ros.running import REPORT_TIMES, ChangeLog
 
 SECONDS = 0.7
 THROTTLED = (
@@ -101,14 +101,14 @@ def test_a_link_that_jitters_does_not_flood_the_log_and_what_was_left_out_is_cou
         paper.changes.check()
         paper.now += 0.01
     # 100 changes a second for 20 s: one line a channel in 5 s.
-    assert len(paper.lines) <= len(NAMES) * (20 / QUIET + 1)
-    paper.now += QUIET
+    assert len(paper.lines) <= len(NAMES) * (20 / REPORT_TIMES.quiet + 1)
+    paper.now += REPORT_TIMES.quiet
     paper.changes.check()
     (last,) = [line for _, line in paper.lines[-2:] if "imu_2.y" in line]
     assert "UNCHECKED now, after" in last
     assert "more changes" in last
     count = len(paper.lines)
-    paper.now += 10 * QUIET
+    paper.now += 10 * REPORT_TIMES.quiet
     paper.changes.check()
     assert len(paper.lines) == count
 

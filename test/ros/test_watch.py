@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 
 from fdi_ros.errors import FdiError
 from fdi_ros.monitor.diagnostics import Level, StatusLine
-from fdi_ros.ros.watch import KEPT_CHANGES, LineReport, Picture, Watcher, draw
+from fdi_ros.ros.watch import CHANGES, LineReport, Picture, Watcher, draw
 
 WORDS = "disagrees with the others by 0.1488 rad/s for 12 s; isolated and left out"
 
@@ -159,11 +159,11 @@ def test_each_change_is_reported_once_and_the_whole_when_it_is_new(
         "FAULTY: 9 of 12 | fused rate +0.500 -1.250 +0.000 rad/s | evidence 3.1 of 19.7"
     )
     # More than is remembered: those that are.
-    for _ in range(2 * KEPT_CHANGES):
+    for _ in range(2 * CHANGES.kept):
         before = {**picture.channels}
         picture.update_channels(before | {"imu_1.x": channel("imu_1.x", "OK")})
         picture.update_channels(before)
-    assert len(report.lines()) == KEPT_CHANGES
+    assert len(report.lines()) == CHANGES.kept
 
 
 EVIL = "\x1b[31mEVIL\x1b]0;pwned\x07[/red][bold]"
