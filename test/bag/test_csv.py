@@ -14,7 +14,7 @@ from bag.test_logs import messages, refusal
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu
 
-from fdi_ros.bag.csv_file import CSV_LINE_BYTES
+from fdi_ros.system.files import TABLE
 
 AXES = "xyz"
 UNITS = units(2, seconds=4.0)
@@ -229,8 +229,8 @@ def test_an_imu_without_values_in_a_line_has_no_message_there(
             "t,gx,gy,gz,gx1,gy1,gz1\n" + "1,0,0,0,0,0,0\n" * 50,
             "has columns of 2 IMUs at times that do not advance",
         ),
-        ("t,gx,gy,gz\n" + "1" * (CSV_LINE_BYTES << 2), "has a line of more than"),
-        ("t," * CSV_LINE_BYTES, "has no line with four or more names"),
+        ("t,gx,gy,gz\n" + "1" * (TABLE.line_bytes << 2), "has a line of more than"),
+        ("t," * TABLE.line_bytes, "has no line with four or more names"),
         (
             "t,gx,gy,gz,gx1,gy1,gz1\n"
             + "".join(f"{10 * k},0,0,0,0,0,0\n" for k in range(50)),
