@@ -25,6 +25,7 @@ from __future__ import annotations
 import codecs
 import contextlib
 import csv
+import itertools
 import math
 import re
 from collections import Counter
@@ -178,7 +179,8 @@ class CsvLog(FlightLog):
             if final and size < len(data):
                 self.note("the last line is not finished and was left out")
             lines = data[:size].split(b"\n")[:-1]
-            ends = offset + np.cumsum([len(one) + 1 for one in lines], dtype=np.int64)
+            lengths = [len(one) + 1 for one in lines]
+            ends = offset + np.cumsum(lengths, dtype=np.int64)
             used = [
                 k
                 for k, one in enumerate(lines)
@@ -242,7 +244,8 @@ def unit_numbers(paths: Sequence[Path]) -> list[int]:
     """Return a number for the IMU of each table: the last in each name, if all differ."""
     found = [re.findall(r"[0-9]{1,3}", path.stem)[-1:] for path in paths]
     numbers = [int(one[0]) for one in found if one]
-    return numbers if len(set(numbers)) == len(paths) else list(range(len(paths)))
+    all_differ = len(set(numbers)) == len(paths)
+    return numbers if all_differ else list(range(len(paths)))
 
 
 def find_columns(
@@ -360,7 +363,8 @@ def _chosen_names(file: BinaryIO, names: Sequence[str], note: Note) -> _Choice:
     time: Any = given.get("time", next(by_name, None))
     listed = shown(", ".join(names), MOST_SHOWN)
     count = Counter(names)
-    for name in (time, *(column for triad in (*imus, *forces) for column in triad)):
+    triads = (*imus, *forces)
+    for name in (time, *itertools.chain.from_iterable(triads)):
         if name not in names:
             missing = "no column of times" if name is None else f"no column {name!r}"
             raise BagError(
@@ -540,7 +544,8 @@ def _forces(names: Sequence[str], imus: Any) -> list[list[str]]:
     known = all(
         _split(name)[1] in ("", *_FORCE_UNITS) for axes in found for name in axes
     )
-    return found if isinstance(imus, list) and len(found) == len(imus) and known else []
+    is_whole = isinstance(imus, list) and len(found) == len(imus)
+    return found if is_whole and known else []
 
 
 def _is_gyro(head: str) -> bool:

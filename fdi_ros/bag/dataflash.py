@@ -181,9 +181,10 @@ def record_end(data: Bytes, position: int, sizes: Int, final: bool) -> int:
     if size < _RECORD_HEAD:
         return 0
     end = position + size
-    if end > len(data) or (end + 2 > len(data) and not final):
+    is_last = end + 2 > len(data)
+    if end > len(data) or (is_last and not final):
         return -1
-    if end + 2 > len(data):
+    if is_last:
         return end
     begins_next = data[end] == 0xA3 and data[end + 1] == 0x95
     return end if begins_next else 0
@@ -215,8 +216,9 @@ def find_records(
                 position += 1
             lost += position - begin
             continue
-        if data[position + 2] == _FMT and sizes[data[position + 3]] == 0:
-            sizes[data[position + 3]] = data[position + 4]
+        described = data[position + 3]
+        if data[position + 2] == _FMT and sizes[described] == 0:
+            sizes[described] = data[position + 4]
         found[0, count] = data[position + 2]
         found[1, count] = position
         count += 1
@@ -430,9 +432,12 @@ class DataflashLog(FlightLog):
                 )
                 # 0 stands for none.
                 factors[i] = said if math.isfinite(said) and said > 0 else 1.0
-                if k < len(units) and self._told["UNIT"].get(units[k], (b"",))[
-                    0
-                ].startswith(b"deg"):
+                (unit,) = (
+                    self._told["UNIT"].get(units[k], (b"",))
+                    if k < len(units)
+                    else (b"",)
+                )
+                if unit.startswith(b"deg"):
                     factors[i] *= math.pi / 180.0
             yield factors
 
@@ -471,7 +476,8 @@ def _layout(
         raise ValueError(f"it has no column {lacking[0]}")
     if sensor and not {"TimeUS", "TimeMS"} & fields.keys():
         raise ValueError("it has no column of times")
-    formats, offsets = ([field[k] for field in fields.values()] for k in (0, 1))
+    formats = [kind for kind, _ in fields.values()]
+    offsets = [offset for _, offset in fields.values()]
     layout: Any = {
         "names": list(fields),
         "formats": formats,

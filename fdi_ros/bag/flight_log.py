@@ -366,7 +366,8 @@ class FlightLog(BagFile):
         throttle = self.throttle.course(self._shift)
         if throttle is not None:
             peak = float(throttle.value.max())
-            full = next((one for one in _FULL if peak <= 1.5 * one), _FULL[-1])
+            possible = (one for one in _FULL if peak <= 1.5 * one)
+            full = next(possible, _FULL[-1])
             throttle = throttle._replace(value=throttle.value / full)
         modes = tuple(
             Mode(self._log_time(one.stamp), self.mode_name(one.name))
@@ -483,7 +484,8 @@ class FlightLog(BagFile):
         good = ((stamp >= 0) & (stamp <= TIMES.log_span)) | (
             (stamp >= TIMES.earliest // 1000) & (stamp <= TIMES.latest // 1000)
         )
-        if len(stamp) > 2 and (np.abs(np.diff(stamp)) > _DAMAGE.step).any():
+        steps = np.abs(np.diff(stamp))
+        if len(stamp) > 2 and (steps > _DAMAGE.step).any():
             # Most of five neighbours are right, and a gap has neighbours on both sides.
             good &= np.abs(stamp - _medians(stamp, 5)) <= _DAMAGE.step
         if good.all():
@@ -604,9 +606,8 @@ def _logged(kind: str, tracks: Sequence[Track]) -> str:
         tracks, key=lambda track: (track.count >= _JUDGED.samples, track.rate)
     )
     few = f", {fastest.count} samples" if 1 < fastest.count < _JUDGED.samples else ""
-    return (
-        f"{kind} of {len(tracks)} IMU{'s' * (len(tracks) > 1)} {fastest.figures}{few}"
-    )
+    plural = "s" if len(tracks) > 1 else ""
+    return f"{kind} of {len(tracks)} IMU{plural} {fastest.figures}{few}"
 
 
 def _encoded(data: Bytes, stamp: Int, samples: ImuSamples) -> Bytes:
@@ -653,10 +654,10 @@ def _copies_of(
         ):
             same.update(pair)
     ordered = sorted(same)
+    if len(same) % 2:
+        return {}
     half = len(same) // 2
-    return (
-        {} if len(same) % 2 else dict(zip(ordered[half:], ordered[:half], strict=True))
-    )
+    return dict(zip(ordered[half:], ordered[:half], strict=True))
 
 
 def possible_start(utc: Int, stamp: Int) -> int | None:

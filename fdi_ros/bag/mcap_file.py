@@ -120,7 +120,8 @@ def walk(
         (kind, data[at : at + size])
         for kind, _, _, at, size in found[:, ~sent].T.tolist()
     ]
-    _, channel, log_time, offset, length = found if sent.all() else found[:, sent]
+    messages = found if sent.all() else found[:, sent]
+    _, channel, log_time, offset, length = messages
     return (
         Batch(buffer, channel, log_time, offset, length, NO_HORIZON, 1.0),
         contents,

@@ -63,7 +63,8 @@ def px4_heartbeat_mode(custom_mode: int) -> str:
     main = custom_mode >> 16 & 0xFF
     sub = custom_mode >> 24 & 0xFF
     name = _PX4_MAIN.get(main, f"mode {main}")
-    return f"{name} {_PX4_AUTO[sub]}" if main == 4 and sub in _PX4_AUTO else name
+    is_auto = main == 4 and sub in _PX4_AUTO
+    return f"{name} {_PX4_AUTO[sub]}" if is_auto else name
 
 
 def px4_navigation_mode(nav_state: int) -> str:

@@ -87,9 +87,8 @@ class Batch:
             for name in ("buffer", *_COLUMNS)
         }
         sizes = [len(part.buffer) for part in parts]
-        columns["offset"] += np.repeat(
-            np.cumsum([0, *sizes[:-1]]), [len(part) for part in parts]
-        )
+        begins = np.cumsum([0, *sizes[:-1]])
+        columns["offset"] += np.repeat(begins, [len(part) for part in parts])
         return replace(parts[-1], **columns)
 
     def message(self, k: int) -> bytes:

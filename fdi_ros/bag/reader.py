@@ -77,7 +77,8 @@ def _hint(name: str, type_name: str, topics: Sequence[tuple[str, str]]) -> str:
 
     ``topics``: name and type of each topic of the recording.
     """
-    listed = ", ".join(f"{shown(one)} ({shown(kind)})" for one, kind in topics)
+    each = [f"{shown(one)} ({shown(kind)})" for one, kind in topics]
+    listed = ", ".join(each)
     alike = [one for one, kind in topics if kind == type_name]
     is_near = alike and did_you_mean(name, alike).startswith("did")
     if not is_near and (other := other_input(type_name, topics)):

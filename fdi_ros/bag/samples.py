@@ -77,7 +77,8 @@ class Samples:
         self.alignment = Alignment(*self.source.alignment)
         n = build_geometry(config).n
         m = len(places(config, possible_units(config, n)))
-        brought = [self.source.brought(k, n, m) for k in range(len(self.topics))]
+        topics = range(len(self.topics))
+        brought = [self.source.brought(k, n, m) for k in topics]
         self._brought = np.array([one.size for one in brought])
         """Number of values that a message of each topic brings."""
         self._gyros = n
@@ -153,8 +154,9 @@ class Samples:
     def _felt_in(self, messages: Rows) -> tuple[int, ...]:
         if not (self.source.units and self._forces):
             return ()
-        units = range(len(self.topics))
-        forces = [messages["values"][messages["topic"] == u, 3:] for u in units]
+        topic = messages["topic"]
+        values = messages["values"]
+        forces = [values[topic == u, 3:] for u in range(len(self.topics))]
         if not any(map(varies, forces)):
             return ()
         return tuple(

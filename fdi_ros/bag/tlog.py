@@ -167,7 +167,8 @@ class Tlog(LibraryLog):
                 del beside[_MOST_BESIDE:]
             elif understood(IMU_MESSAGES[number].kind, autopilot):
                 self._take_sample(found, message, data[at:end], came, end)
-        raw, scaled = (Source(IMU_MESSAGES[number].kind, 0) for number in (RAW, SCALED))
+        raw = Source(IMU_MESSAGES[RAW].kind, 0)
+        scaled = Source(IMU_MESSAGES[SCALED].kind, 0)
         if raw in found and scaled not in found:
             found[scaled] = found.pop(raw)
         tables = {
@@ -314,7 +315,8 @@ def record_end(data: bytes, at: int) -> int:
         end += 4 + 13 * (data[at + _TIME + 2] & 1)
     if end + _TIME >= len(data):
         return end
-    return end if data[end] == 0 and data[end + _TIME] in _MARKS else 0
+    goes_on = data[end] == 0 and data[end + _TIME] in _MARKS
+    return end if goes_on else 0
 
 
 def _stamps_of(beside: Sequence[_Beside], tables: Sequence[NDArray[Any]]) -> list[int]:
@@ -339,7 +341,8 @@ def _stamps_of(beside: Sequence[_Beside], tables: Sequence[NDArray[Any]]) -> lis
 
 def _start_utc_by(starts: Sequence[Int]) -> int | None:
     """Return the UTC of the start of the autopilot by the message with the least delay."""
-    ordered = np.sort(np.concatenate([np.empty(0, np.int64), *starts]))
+    none = np.empty(0, np.int64)
+    ordered = np.sort(np.concatenate([none, *starts]))
     # A time that is an hour off is damaged.
     near = (
         ordered[ordered >= np.median(ordered) - 3_600_000_000]

@@ -104,7 +104,8 @@ class _Bounded(io.BytesIO):
                 else LOGS.ulog_message_cost
             )
             self._left -= (data[0] | data[1] << 8) + cost
-        self.cut = len(data) < (size or 0) and not (size == _HEAD and not data)
+        is_end = size == _HEAD and not data
+        self.cut = len(data) < (size or 0) and not is_end
         self.reached = max(self.reached, self.tell())
         return data
 

@@ -253,7 +253,8 @@ def warm_verbs() -> None:
         found = np.empty((2, 1), dtype=np.int64)
         find_records(np.frombuffer(b"\0", dtype=np.uint8), sizes, True, found)
     rests(np.zeros((REST_BLOCKS, 3)), 0, np.ones(3), np.ones(3), 0.0)
-    fill_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), np.zeros((3, SIGNALS)))
+    signals = np.zeros((3, SIGNALS))
+    fill_signals(allocate(Layout)[0], np.zeros(3), np.zeros(3), signals)
     Guaranteed(Geometry.cone(4), NoiseModel(0.01, bound=0.04)).error_bounds(
         np.zeros((1, 4))
     )

@@ -155,7 +155,8 @@ class Config:
 
     def __repr__(self) -> str:
         """Describe the parameters that differ from their defaults."""
-        return f"Config({', '.join(f'{name}={value!r}' for name, value in self.changed.items())})"
+        words = [f"{name}={value!r}" for name, value in self.changed.items()]
+        return f"Config({', '.join(words)})"
 
     def _repr_html_(self) -> str:
         rows = [
@@ -564,14 +565,15 @@ def _entry(name: str, value: Any, remark: str, indent: int) -> Iterator[str]:
         if declared.unit
         else declared.description
     )
-    comment = (
-        f"# {meaning}. {remark[0].upper()}{remark[1:]}" if remark else f"# {meaning}"
-    )
+    comment = f"# {meaning}"
+    if remark:
+        comment += f". {remark[0].upper()}{remark[1:]}"
     rows = list(_value(value))
     key = name.rpartition(".")[2]
     row = rows[0] if len(rows) == 1 else ""
     line = f"{margin}{key}: {row}".rstrip()
-    if len(rows) == 1 and len(line) + 1 + len(comment) <= WIDTH:
+    width = len(line) + 1 + len(comment)
+    if len(rows) == 1 and width <= WIDTH:
         yield f"{line} {comment}"
         return
     yield from textwrap.wrap(

@@ -35,7 +35,8 @@ def _by_difference(topics: Sequence[str]) -> list[str]:
     paths = [topic.strip("/").split("/") for topic in topics]
     same_head = _common(paths)
     same_tail = _common([path[same_head:][::-1] for path in paths])
-    own = [path[same_head : len(path) - same_tail] or path for path in paths]
+    differ = [path[same_head : len(path) - same_tail] for path in paths]
+    own = [part or path for part, path in zip(differ, paths, strict=True)]
     names = [_NOT_IN_NAMES.sub("_", "_".join(parts)).strip("_") for parts in own]
     named = all(name and not name[0].isdigit() for name in names)
     return names if named and len(set(names)) == len(names) else []
