@@ -204,7 +204,8 @@ def _is_ahead(aligner: Aligner, j: int, stamp: int) -> bool:
         unit = aligner.units[k]
         if k != j and unit.end > 0 and not _is_silent(aligner, unit):
             others += 1
-            near += 1 if stamp - unit.newest - unit.passed[j] <= aligner.timeout else 0
+            ahead = stamp - unit.newest - unit.passed[j]
+            near += 1 if ahead <= aligner.timeout else 0
     return near == 0 if others > 1 else stamp - aligner.common > aligner.timeout
 
 
@@ -468,7 +469,8 @@ def _match(unit: Unit, after: int, stamp: int, step: int, max_skew: int) -> int:
         message = unit.messages[k % RING]
         apart = abs(message.stamp - stamp)
         # Less than half a step away: otherwise the message after a lost one would match.
-        if k < unit.end and apart <= max_skew and 2 * apart < min(message.step, step):
+        is_near = apart <= max_skew and 2 * apart < min(message.step, step)
+        if k < unit.end and is_near:
             return k
     return -1
 
@@ -564,7 +566,8 @@ class Alignment:
         row["max_skew"] = max_skew
         row["timeout"] = timeout
         row["bridge"] = int(MAX_BRIDGE * timeout)
-        row["units"]["delay"][: len(delays)] = [round(1e9 * delay) for delay in delays]
+        delays_ns = [round(1e9 * delay) for delay in delays]
+        row["units"]["delay"][: len(delays)] = delays_ns
 
     def push(self, unit: int, stamp: int, rate: Sequence[float]) -> NDArray[Any]:
         """Enter one message and return the samples that it completes, (S,) `Sample`.
@@ -594,9 +597,8 @@ class Alignment:
         """Return the remaining samples at the end of a recording, (S,) `Sample`."""
         self.rows["phase"] = _FORMING
         self.rows["force"] = _ALL
-        return self._aligned(
-            np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 6))
-        )
+        none = np.empty(0, dtype=np.int64)
+        return self._aligned(none, none, np.empty((0, 6)))
 
     def is_live(self, unit: int) -> bool:
         """Return whether samples wait for a unit."""

@@ -101,7 +101,8 @@ def f_quantile(probability: float, above: int, below: int) -> float:
     density = (above - 1) * np.log(np.cos(middle)) + (below - 1) * np.log(
         np.sin(middle)
     )
-    share = np.concatenate([[0.0], np.cumsum(np.exp(density - density.max()))])
+    relative = np.exp(density - density.max())
+    share = np.concatenate([[0.0], np.cumsum(relative)])
     angle = float(np.interp(probability * share[-1], share, edges))
     return below / above / math.tan(angle) ** 2
 

@@ -255,7 +255,8 @@ def copies_among(series: Sequence[Array]) -> list[tuple[int, int]]:
         size = min(len(series[a]), len(series[b]), RESTAMP_SAMPLES)
         values = np.hstack([series[a][-size:], series[b][-size:]])
         rows["values"][:size, :6] = values
-        rows["plain"][:size] = (np.abs(values) < MAX_RATE) @ (1 << np.arange(6))
+        is_plain = np.abs(values) < MAX_RATE
+        rows["plain"][:size] = is_plain @ (1 << np.arange(6))
         hits = 0
         for count in (size, size * 3 // 4, size // 2):
             buffer["count"] = max(count, ROWS + 3)

@@ -355,7 +355,8 @@ def add_units(
     doubted = whole = 0
     for u in range(settings.units):
         inside = now.usable & settings.members[u]
-        if inside and not inside & ~doubtful and subsets[now.usable & ~inside].spans:
+        is_doubted = inside and not inside & ~doubtful
+        if is_doubted and subsets[now.usable & ~inside].spans:
             doubted |= 1 << u
             whole += 1
     for u in range(settings.units):

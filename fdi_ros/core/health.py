@@ -95,7 +95,8 @@ def receive(
         if z != health.value[i] or hole:
             health.run_stamp[i] = stamp
             health.ended[i] = health.repeats[i]
-        if change > 0.0 and (change < health.step[i] or health.step[i] == 0.0):
+        is_smaller = change < health.step[i] or health.step[i] == 0.0
+        if change > 0.0 and is_smaller:
             health.step[i] = change
         follow_rail(settings, health, i, z)
         health.value[i] = z
@@ -182,7 +183,8 @@ def follow_rail(settings: PathSettings, health: Health, i: int, z: float) -> Non
     """
     size = abs(z)
     before = abs(health.value[i])
-    health.repeats[i] = health.repeats[i] + 1 if z == health.value[i] else 1
+    repeats = z == health.value[i]
+    health.repeats[i] = health.repeats[i] + 1 if repeats else 1
     if size > health.extreme[i] and before > health.extreme[i]:
         reached = size if size < before else before
         if reached > health.extreme[i] + RAIL_SHARE * reached + 2.0 * RAIL_OFFSET:
@@ -226,7 +228,8 @@ def follow_share(health: Health, i: int, finite: bool, step: int) -> None:
     ):
         return
     adaptation_gain = min(step / SHARE_TIME, 1.0 / SHARE_SAMPLES)
-    health.gone[i] += adaptation_gain * ((0.0 if finite else 1.0) - health.gone[i])
+    gone = 0.0 if finite else 1.0
+    health.gone[i] += adaptation_gain * (gone - health.gone[i])
     health.leaves[i] *= 1.0 - adaptation_gain
     if not finite and health.bad_stamp[i] == NOT_BAD:
         health.leaves[i] += 1.0

@@ -69,7 +69,8 @@ def read_bits(data: Bytes, at: int, size: int, little: bool) -> int:
 def read_doubles(data: Bytes, at: int, count: int, little: bool, values: Array) -> None:
     """Read count doubles into values, (count,) or longer."""
     for i in range(count):
-        values[i] = np.int64(read_bits(data, at + 8 * i, 8, little)).view(np.float64)
+        bits = read_bits(data, at + 8 * i, 8, little)
+        values[i] = np.int64(bits).view(np.float64)
 
 
 @compiled
@@ -337,7 +338,8 @@ class ImuTemplate:
         self, stamp: int, rate: Sequence[float], covariance: Sequence[float]
     ) -> bytes:
         """Return the message with stamp, ns, rate (3,), rad/s, and covariance (9,), (rad/s)^2."""
-        upper = np.array([covariance[i] for i in (0, 1, 2, 4, 5, 8)], dtype=np.float64)
+        triangle = [covariance[i] for i in (0, 1, 2, 4, 5, 8)]
+        upper = np.array(triangle, dtype=np.float64)
         fill_imu(
             self.bytes,
             self.at,
@@ -364,7 +366,8 @@ class ChannelsTemplate:
         head += struct.pack("<II", 0, count)  # offset of the data
         head += bytes(-(len(head) - ENCAPSULATION) % 8)
         self.count = count
-        self.bytes = np.frombuffer(bytearray(head + bytes(8 * count)), dtype=np.uint8)
+        message = bytearray(head + bytes(8 * count))
+        self.bytes = np.frombuffer(message, dtype=np.uint8)
         """The message, to be copied or filled in place."""
         self.at = len(head)  #: Index of the values.
 

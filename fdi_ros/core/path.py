@@ -438,8 +438,10 @@ def begin_bias(core: Core) -> None:
     for i in range(n):
         largest = max(largest, core.health.step[i])
     for i in range(n):
-        step = core.health.step[i] if core.health.step[i] > 0.0 else largest
-        std = settings.turn_on_std if motion or lost >> i & 1 else settings.learned[i]
+        own = core.health.step[i]
+        step = own if own > 0.0 else largest
+        is_unknown = motion or lost >> i & 1
+        std = settings.turn_on_std if is_unknown else settings.learned[i]
         if not motion and step > settings.sensors.noise_std[i]:
             # The noise is smaller than the step of the sensor, and the average does
             # not remove the quantisation error: up to half a step at rest.

@@ -94,7 +94,8 @@ def interpolate(
     after = buffer.rows[(k + 1) % RESTAMP_SAMPLES]
     span = after.stamp - before.stamp
     found = members & before.received & after.received & ~(before.plain ^ after.plain)
-    if k + 1 >= buffer.count or before.stamp > stamp or span > MAX_STEPS * buffer.step:
+    is_outside = k + 1 >= buffer.count or before.stamp > stamp
+    if is_outside or span > MAX_STEPS * buffer.step:
         found = 0
     share = (stamp - before.stamp) / max(span, 1)
     first = buffer.rows[(k - 1) % RESTAMP_SAMPLES]

@@ -235,9 +235,8 @@ class UnitSource(Source):
         self.timeout = config.unit_timeout
         self.max_lag = imus.max_skew
         self.delays = imus.delays or (0.0,) * count
-        self.mounts = list(
-            np.reshape(imus.mounts or tuple(np.eye(3).ravel()) * count, (-1, 3, 3))
-        )
+        along_body = tuple(np.eye(3).ravel()) * count
+        self.mounts = list(np.reshape(imus.mounts or along_body, (-1, 3, 3)))
 
     def brought(self, topic: int, n: int, m: int) -> Brought:
         """Return the channels of the unit."""
@@ -346,7 +345,8 @@ class ImuSource(UnitSource):
         """Return a message with another rate, and with six values also another specific force."""
         patched = super().patch(data, values[:3])
         if len(values) == 6:
-            at = cls.place(as_batch(data)[0], 0, len(data), 3) + 8 * IMU_BEFORE_FORCE
+            begin = cls.place(as_batch(data)[0], 0, len(data), 3)
+            at = begin + 8 * IMU_BEFORE_FORCE
             force = struct.pack(f"{byte_order(data)}3d", *values[3:])
             patched = patched[:at] + force + patched[at + len(force) :]
         return patched

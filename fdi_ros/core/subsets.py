@@ -112,7 +112,8 @@ def prepare_capability(
     subsets["detectable"] = 0
     gain = np.linalg.pinv(bits[runs][:, :, None] * geometry.axes).transpose(0, 2, 1)
     share = 1 - np.einsum("kij,ij->ki", gain, geometry.axes)
-    seen = bits[runs] & (np.sqrt(np.clip(share, 0, None)) >= MIN_SENSITIVITY)
+    sensitivity = np.sqrt(np.clip(share, 0, None))
+    seen = bits[runs] & (sensitivity >= MIN_SENSITIVITY)
     subsets["detectable"][runs] = (seen << np.arange(n)).sum(axis=1)
 
 

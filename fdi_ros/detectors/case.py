@@ -614,7 +614,8 @@ def fill_louder(params: Constants, state: State, size: int) -> bool:
     for i in range(params.sensors.n):
         inference.louder[i] = 0.0
         if kf.judged >> i & 1:
-            grown = mean_step(scale, i, min(max(size - 1, FEWEST_STEPS), KEPT - 1), 2)
+            steps = min(max(size - 1, FEWEST_STEPS), KEPT - 1)
+            grown = mean_step(scale, i, steps, 2)
             if 1 < size <= FEWEST_STEPS:
                 grown = max(grown, mean_step(scale, i, size - 1, size > 3))
             if square_of_mean(scale, i, min(size, KEPT)) > STEADY_RATIO * grown:

@@ -94,7 +94,8 @@ def add_evidence(
             sums = scale.sums[side, i]
             total = 0.0
             size = SMALLEST
-            factor = math.exp(SMALLEST * min(y if side == 0 else -y, STEP_LIMIT))
+            along = y if side == 0 else -y
+            factor = math.exp(SMALLEST * min(along, STEP_LIMIT))
             for k in range(SIZES):
                 if k >= first:
                     sums[k] = min(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.model.quantity import RATE, Quantity
-from fdi_ros.model.samples import Array
+from fdi_ros.model.samples import Array, flag_runs
 
 
 class _RangeSigns(NamedTuple):
@@ -63,12 +63,10 @@ class Values:
             self._run[i] = 0
             self.saturated[i] = 0
         at_end = size == largest
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], at_end, [0]])))
-        for first, last in edges.reshape(-1, 2).tolist():
-            run = last - first + (int(self._run[i]) if first == 0 else 0)
+        for first, last in flag_runs(at_end).tolist():
+            before = int(self._run[i]) if first == 0 else 0
+            run = last - first + before
             if run >= _RANGE.run:
-                counted = (
-                    run - (last - first) if run - (last - first) >= _RANGE.run else 0
-                )
+                counted = before if before >= _RANGE.run else 0
                 self.saturated[i] += run - counted
             self._run[i] = run if last == len(size) else 0

@@ -24,6 +24,13 @@ MAX_RATE = 1e3
 LARGEST_GYRO_RANGE = 36.0
 
 
+def flag_runs(flags: Mask) -> Int:
+    """First index and end (R, 2) of every run of set flags (N,)."""
+    with_ends = np.concatenate([[False], flags, [False]])
+    edges = np.diff(with_ends.astype(np.int8))
+    return np.flatnonzero(edges).reshape(-1, 2)
+
+
 @dataclass(frozen=True)
 class Block:
     """Consecutive samples of all channels.

@@ -17,7 +17,7 @@ from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.bag.raw import Batch
 from fdi_ros.bag.samples import steps_of
 from fdi_ros.core.states import ChannelState
-from fdi_ros.model.samples import Array, Int
+from fdi_ros.model.samples import Array, Int, flag_runs
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.recent import USUAL_QUANTILE
 from fdi_ros.monitor.soundness import UnitHealth, own_noise
@@ -198,13 +198,12 @@ def _delivery(shares: Array, times: Array, width: float, rate: float) -> Deliver
     if not len(shares):
         return Delivery(1.0, None)
     share = float(shares.mean())
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], shares < WINDOWS.slow, [0]])))
-    runs = edges.reshape(-1, 2)
-    longest = max(runs.tolist(), key=lambda run: run[1] - run[0], default=[0, 0])
-    first, last = longest
+    runs = flag_runs(shares < WINDOWS.slow).tolist()
+    first, last = max(runs, key=lambda run: run[1] - run[0], default=[0, 0])
     if last - first < WINDOWS.least_slow:
         return Delivery(share, rate)
-    slow_to = None if last == len(shares) else float(times[last - 1] + width)
+    is_to_end = last == len(shares)
+    slow_to = None if is_to_end else float(times[last - 1] + width)
     slow_rate = rate * float(shares[first:last].mean())
     return Delivery(share, rate, float(times[first]), slow_to, slow_rate)
 

@@ -126,12 +126,6 @@ def spikes(z: Array, axes: Array) -> Mask:
     return found
 
 
-def flag_runs(flags: Mask) -> Int:
-    """First index and end (R, 2) of every run of set flags (N,)."""
-    edges = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
-    return np.flatnonzero(edges).reshape(-1, 2)
-
-
 #: of the interpolation
 POINTS = 6
 #: share of a window that a channel must deliver

@@ -29,7 +29,7 @@ from fdi_ros.errors import (
 from fdi_ros.inspection.turns import TURNS
 from fdi_ros.model.geometry import Geometry, spans_space
 from fdi_ros.model.noise import NoiseModel
-from fdi_ros.model.samples import Array, Block, Int, Mask
+from fdi_ros.model.samples import Array, Block, Int, Mask, flag_runs
 from fdi_ros.monitor.building import (
     CHANNEL_DELAY,
     UNIT_DELAY,
@@ -50,7 +50,6 @@ from fdi_ros.setup.agreement import LEAST_RATE, MOUNT_ERRORS, check_agreement
 from fdi_ros.setup.blocks import (
     NOT_SHIFTED,
     Data,
-    flag_runs,
     prepare,
     resampled,
     spikes,

@@ -31,7 +31,7 @@ from fdi_ros.inspection.fitness import (
 )
 from fdi_ros.inspection.topics import topic_columns
 from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
-from fdi_ros.model.samples import Array
+from fdi_ros.model.samples import Array, flag_runs
 from fdi_ros.monitor.soundness import REPORTED, Trouble
 from fdi_ros.replay.sweep_report import declared_figures
 from fdi_ros.replay.verdict import LEAST_JUDGED
@@ -54,7 +54,6 @@ from fdi_ros.report.layout import (
 )
 from fdi_ros.setup.accelerometers import AccelerometerFit
 from fdi_ros.setup.agreement import MOUNT_ERRORS
-from fdi_ros.setup.blocks import flag_runs
 from fdi_ros.setup.calibrate import Calibration, Span, StampDelay
 from fdi_ros.setup.channels import UNMEASURED, ChannelFit
 from fdi_ros.setup.estimate import SHOWN_DELAY

@@ -380,7 +380,8 @@ class Cusum(Detector):
         )
         params["bias"][:n] = params["squares"][:n, :n] @ self.noise.bias_std**2
         seen = np.flatnonzero(geometry.detectable).tolist()
-        first = [seen.index(group[0]) for group in geometry.groups if group[0] in seen]
+        heads = [group[0] for group in geometry.groups]
+        first = [seen.index(head) for head in heads if head in seen]
         directions = whitened_directions(geometry, self.noise)[first]
         rho = directions @ directions.T
         self.threshold = threshold_for(

@@ -62,7 +62,8 @@ def _pairs(unit: Array) -> Array:
 def _triples(unit: Array) -> Array:
     index = np.array(list(combinations(range(len(unit)), 3)))
     a, b, c = unit[index.T]
-    dependent = np.abs((a * np.cross(b, c)).sum(axis=1)) < ROUNDING
+    volume = (a * np.cross(b, c)).sum(axis=1)
+    dependent = np.abs(volume) < ROUNDING
     # In a plane with unit normal N: (b x c . N) a + (c x a . N) b + (a x b . N) c = 0.
     products = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
     products = products[dependent]
@@ -100,7 +101,8 @@ def _contains(rows: Array, smaller: Array) -> NDArray[np.bool_]:
     """Return for each row whether its support contains a smaller circuit's."""
     support = (rows != 0).astype(np.int64)
     small = (smaller != 0).astype(np.int64)
-    contains: NDArray[np.bool_] = (support @ small.T == small.sum(axis=1)).any(axis=1)
+    inside = support @ small.T == small.sum(axis=1)
+    contains: NDArray[np.bool_] = inside.any(axis=1)
     return contains
 
 
@@ -428,7 +430,8 @@ class Guaranteed(Detector):
         params["circuits"] = count
         params["checks"][:n, :count] = checks.T
         params["weight"][:count, :n] = np.abs(checks) * self.bound
-        struck = np.array([[i in channels for i in range(n)] for channels in self.sets])
+        members = [[i in channels for i in range(n)] for channels in self.sets]
+        struck = np.array(members)
         untouched = (struck @ (checks != 0).T) == 0
         params["rules_out"][:count] = (1 << np.arange(len(self.sets))) @ untouched
         largest = [
@@ -467,7 +470,8 @@ class Guaranteed(Detector):
     def culprits(self, z: Array) -> Mask:
         """Return for each finite sample z (N, n) which of `sets` explain it, (N, sets)."""
         ruled_out, _, _ = self._explain(self._checked(z))
-        return np.asarray(ruled_out[:, None] >> np.arange(len(self.sets)) & 1 == 0)
+        bits = ruled_out[:, None] >> np.arange(len(self.sets))
+        return np.asarray(bits & 1 == 0)
 
     def error_bounds(self, z: Array) -> tuple[Array, Array]:
         """Return the guaranteed interval of every channel's error.

@@ -204,9 +204,8 @@ def _basic_solutions(
     sets = np.array(list(combinations(np.flatnonzero(seen), m)))
     directions = basis[sets].transpose(0, 2, 1)
     spans = np.abs(np.linalg.det(directions)) > ROUNDING
-    solutions = np.linalg.solve(
-        directions[spans], np.broadcast_to(basis.T, (int(spans.sum()), m, n))
-    )
+    shape = (int(spans.sum()), m, n)
+    solutions = np.linalg.solve(directions[spans], np.broadcast_to(basis.T, shape))
     return sets[spans], solutions
 
 

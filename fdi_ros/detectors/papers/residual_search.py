@@ -182,5 +182,6 @@ def _squares(geometry: Geometry, weighted: Callable[[Array, Array], Array]) -> A
     terms = np.zeros((geometry.n - 4, geometry.n, geometry.n))
     for i, forms, gain in _left_out(geometry):
         _, singular, rows = np.linalg.svd(weighted(forms, gain), full_matrices=False)
-        terms[: len(singular), i] = (singular[:, None] * rows)[: len(terms)]
+        scaled = singular[:, None] * rows
+        terms[: len(singular), i] = scaled[: len(terms)]
     return terms
