@@ -101,9 +101,8 @@ def in_degrees(
             DEGREE_SIGNS.gentle_rotation,
             DEGREE_SIGNS.gentle_over_noise * _mean_noise(slow_one),
         )
-        factor = _degrees_factor(
-            fast, slow, TURNS.least_rotation, 2
-        ) or _degrees_factor(fast, slow, gentle, 3)
+        factor = _degrees_factor(fast, slow, TURNS.least_rotation, 2)
+        factor = factor or _degrees_factor(fast, slow, gentle, 3)
         if factor:
             times = (
                 f"{figures(factor)} times the rotation of {shown(slow_one.topic.name)}"
@@ -135,7 +134,8 @@ def _degrees_factor(fast: Array, slow: Array, least: float, count: int) -> float
     moving = (slow > least) & np.isfinite(fast + slow)
     factors = fast[moving] / slow[moving]
     near = np.abs(factors / DEGREES.factor - 1.0) < DEGREE_SIGNS.near
-    return float(np.median(factors)) if len(factors) >= count and near.all() else 0.0
+    is_sure = len(factors) >= count and near.all()
+    return float(np.median(factors)) if is_sure else 0.0
 
 
 def _mean_noise(report: TopicReport) -> float:
@@ -236,6 +236,7 @@ def _are_mounted_alike(first: TopicReport, second: TopicReport) -> bool:
     """Whether two units show the same motion about the same axes."""
     means = [one.segments.means for one in (first, second)]
     size = min(map(len, means))
-    one, other = (each[:size] - np.median(each[:size], axis=0) for each in means)
+    whole = [each[:size] for each in means]
+    one, other = (each - np.median(each, axis=0) for each in whole)
     power = float((one**2).sum() + (other**2).sum())
     return float(((one - other) ** 2).sum()) < (1.0 - TURNS.shared) * power

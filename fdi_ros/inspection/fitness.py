@@ -112,7 +112,8 @@ def clocks_apart(reports: Sequence[TopicReport], beyond: float = 1.0) -> str:
             (shown(report.topic.name), report.ahead - first.ahead) for report in reports
         ]
     )
-    words = [f"{name} {_apart_words(v)}" for name, v in off if abs(v) > beyond]
+    far = [(name, ahead) for name, ahead in off if abs(ahead) > beyond]
+    words = [f"{name} {_apart_words(ahead)}" for name, ahead in far]
     if first is None or not words:
         return ""
     return (
@@ -132,7 +133,8 @@ def _apart_words(ahead: float) -> str:
 
 def no_common_time(reports: Sequence[TopicReport]) -> str:
     """Name the units whose stamps do not overlap with those of the first, may be empty."""
-    spans = [(one.topic.name, *one.stamps) for one in reports if one.stamps is not None]
+    stamped = [(one.topic.name, one.stamps) for one in reports]
+    spans = [(name, *stamps) for name, stamps in stamped if stamps is not None]
     if not spans:
         return ""
     if set_back := [one for one in spans if one[2] < one[1]]:
@@ -333,7 +335,8 @@ def recording_findings(
     words += f" at {figures(max(one.rate for one in chosen))} Hz can be judged"
     noise = np.concatenate([one.segments.noise().moving for one in chosen])
     if noisy := much_noisier(noise, groups):
-        who = dict.fromkeys(names[i].partition(" ")[0] for i, _ in noisy)
+        channels = [names[i] for i, _ in noisy]
+        who = dict.fromkeys(name.partition(" ")[0] for name in channels)
         more = noisier_words(names, noise, groups, unit.name, unit.factor)
         yield _look("noise", f"{more} from sample to sample", Trouble.NOISE, list(who))
     yield Finding(Role.WORTH, "ready", words, headline="READY")
@@ -409,7 +412,8 @@ def bad_values(
     frozen = {one.topic.name: _repeating(one) for one in chosen if _repeating(one)}
     if frozen and not saturated:
         names = [name for some in frozen.values() for name in some]
-        share = max(float(one.repeats.count.max()) / one.received for one in chosen)
+        most = [float(one.repeats.count.max()) / one.received for one in chosen]
+        share = max(most)
         verb = "repeats" if len(names) == 1 else "repeat"
         words = f"{listed(names)} {verb} one value for long, in {percent(share)} of the messages"
         yield _look("frozen", words, Trouble.REPEATS, list(frozen), headline)
@@ -421,7 +425,8 @@ def _repeating(one: TopicReport) -> list[str]:
     much = one.repeats.count >= DOUBTFUL.frozen * one.received
     if much.all():
         return [name]
-    return [f"{name} {place}" for place in np.array(one.places)[much].tolist()]
+    places = np.array(one.places)[much].tolist()
+    return [f"{name} {place}" for place in places]
 
 
 def _spike_words(one: TopicReport) -> list[str]:
@@ -491,5 +496,6 @@ _NO_REDUNDANCY = "one sensor on two topics is no redundancy"
 
 def copy_words(reports: Sequence[TopicReport]) -> str:
     """Name the topics that repeat the values of others, may be empty."""
-    copies = [f"{shown(one.topic.name)} {one.copied}" for one in reports if one.copy_of]
+    copying = [one for one in reports if one.copy_of]
+    copies = [f"{shown(one.topic.name)} {one.copied}" for one in copying]
     return f"{' and '.join(copies)}: {_NO_REDUNDANCY}" if copies else ""

@@ -136,16 +136,15 @@ class NoiseSegments:
     def all_segments(self) -> list[NoiseSegment]:
         """Segments; without any, a segment of the values so far."""
         whole = len(self._waiting) // REST_BLOCKS * REST_BLOCKS
-        return self._kept or (
-            [_segment(self._waiting[:whole], int(self._times[0]))] if whole else []
-        )
+        if self._kept or not whole:
+            return self._kept
+        return [_segment(self._waiting[:whole], int(self._times[0]))]
 
     @property
     def means(self) -> Array:
         """Means of blocks (B, c), rad/s."""
-        return np.concatenate(
-            [one.means for one in self.all_segments()] or [np.zeros((1, self.channels))]
-        )
+        means = [one.means for one in self.all_segments()]
+        return np.concatenate(means or [np.zeros((1, self.channels))])
 
     def noise(self, largest_bias: float = LARGEST_BIAS) -> Noise:
         """Work out the noise of all so far, of gyros with biases of so much, rad/s."""
@@ -203,7 +202,8 @@ def _least_noise(segments: list[NoiseSegment]) -> tuple[Array, Array]:
     for column in (*noise.T, *block.T):
         if column.any():
             column[column == 0.0] = np.median(column[column > 0.0])
-    quiet = np.argsort((noise**2).sum(axis=1))[: max(3, len(noise) // 100)]
+    power = (noise**2).sum(axis=1)
+    quiet = np.argsort(power)[: max(3, len(noise) // 100)]
     # The quietest few are biased by chance. All segments about as quiet are not.
     for _ in range(ROUNDS):
         alike = np.flatnonzero(

@@ -148,11 +148,13 @@ def turned_units(path: Path, config: Config) -> str:
             .mean(axis=1)
             for block in Samples(recording, config).blocks()
         ]
-    slow = np.concatenate([np.zeros((0, 3 * len(names))), *means])
+    none = np.zeros((0, 3 * len(names)))
+    slow = np.concatenate([none, *means])
     slow = slow[(np.abs(slow) < BELIEVED).all(axis=1)]
     if len(slow) < TURNS.least_windows:
         return ""
-    first, *others = np.split(slow - np.median(slow, axis=0), len(names), axis=1)
+    turning = slow - np.median(slow, axis=0)
+    first, *others = np.split(turning, len(names), axis=1)
     turned = []
     for name, rate in zip(names[1:], others, strict=True):
         rotation = find_turn(first, rate)[0]

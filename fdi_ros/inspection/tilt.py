@@ -99,7 +99,8 @@ def _runs(rates: NoiseSegments, forces: NoiseSegments) -> list[list[_Pair]]:
         nearest = int(np.abs(begin - one.first).argmin())
         if abs(begin[nearest] - one.first) > BLOCK_TIME * 1e9:
             continue
-        if runs[-1] and one.first - runs[-1][-1].first > SWING_WINDOWS.gap * usual:
+        run = runs[-1]
+        if run and one.first - run[-1].first > SWING_WINDOWS.gap * usual:
             runs.append([])
         runs[-1].append(_Pair(one.first, one.means, felt[nearest].means))
     return runs

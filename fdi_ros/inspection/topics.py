@@ -145,7 +145,8 @@ class TopicReport:
         usual = usual_interval(steps)
         if usual <= INTERVALS.burst_ratio * float(np.median(steps)):
             return 1
-        return max(2, round(len(steps) / max(1, int((steps > usual).sum()))))
+        breaks = max(1, int((steps > usual).sum()))
+        return max(2, round(len(steps) / breaks))
 
     @property
     def places(self) -> list[str]:
@@ -259,7 +260,8 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     report.not_finite += (~finite).sum(axis=0)
     report.beyond += (finite & ~believed).sum(axis=0)
     if believed.any():
-        report.largest = float(np.fmax(report.largest, np.abs(values[believed]).max()))
+        largest = np.abs(values[believed]).max()
+        report.largest = float(np.fmax(report.largest, largest))
     sizes = np.abs(np.vstack([report.recent[-1:], values]))
     pairs = np.maximum(sizes[1:], sizes[:-1]) < BELIEVED
     if pairs.any():
@@ -324,7 +326,8 @@ def _take_frames(report: TopicReport, batch: Batch, rows: Int) -> None:
     begin = batch.offset[rows] + ENCAPSULATION + 12
     frames = batch.buffer[begin[:, np.newaxis] + np.arange(size)]
     report.frame = frame if report.frame is None else report.frame
-    report.frame_changes |= frame != report.frame or bool((frames != frames[0]).any())
+    differ = bool((frames != frames[0]).any())
+    report.frame_changes |= frame != report.frame or differ
 
 
 def _take_stamps(report: TopicReport, stamp: Int) -> None:

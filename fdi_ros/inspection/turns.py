@@ -46,7 +46,8 @@ def find_turn(first: Array, unit: Array) -> tuple[Array, Array, float]:
     units never turn about two axes.
     """
     left, size, right = np.linalg.svd(first.T @ unit)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    handedness = np.sign(np.linalg.det(left @ right))
+    sign = np.array([1.0, 1.0, handedness])
     rotation = (left * sign) @ right
     mirrored = (left * sign * [1.0, 1.0, -1.0]) @ right
     if size[1] <= ROUNDING * size[0]:
@@ -61,6 +62,5 @@ def find_turn(first: Array, unit: Array) -> tuple[Array, Array, float]:
 
 def angle_of(rotation: Array) -> float:
     """Angle of a rotation (3, 3), rad."""
-    return 2.0 * math.asin(
-        min(float(np.linalg.norm(rotation - np.eye(3))) / math.sqrt(8.0), 1.0)
-    )
+    distance = float(np.linalg.norm(rotation - np.eye(3)))
+    return 2.0 * math.asin(min(distance / math.sqrt(8.0), 1.0))
