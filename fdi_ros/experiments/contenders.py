@@ -89,7 +89,8 @@ def _products(z: Array, forms: Array) -> Array:
 
     The sums go in the order of channels, on every machine.
     """
-    return np.asarray((z[:, None, :] * forms).cumsum(axis=2)[:, :, -1])
+    terms = z[:, None, :] * forms
+    return np.asarray(terms.cumsum(axis=2)[:, :, -1])
 
 
 BOUND = 3.0
@@ -185,7 +186,8 @@ def _largest(size: Array) -> NDArray[np.intp]:
     """Return the column of the largest value of each row, (N,), equal within rounding."""
     size = np.nan_to_num(size, nan=-1.0)
     top = size.max(axis=1, keepdims=True)
-    return np.round(size / np.where(top > 0, top, 1.0), 9).argmax(axis=1)
+    relative = size / np.where(top > 0, top, 1.0)
+    return np.round(relative, 9).argmax(axis=1)
 
 
 # One false-alarm rate for all ---------------------------------------------------------

@@ -382,7 +382,8 @@ def _counted(monitor: Pipeline, flights: Sequence[Flown]) -> Counts:
             ("before", slice(flown.onset)),
             ("after", slice(flown.onset, None)),
         ):
-            squares = ((output.rate[rows] - flown.truth[rows]) ** 2).sum(axis=1)
+            error = output.rate[rows] - flown.truth[rows]
+            squares = (error**2).sum(axis=1)
             errors[part].append(squares[output.valid[rows]])
     return {
         "trials": len(flights),

@@ -125,11 +125,8 @@ def _alike_together(
     alike: dict[tuple[str, ...], list[str]] = {}
     for name, *words in rows:
         alike.setdefault(tuple(words), []).append(name)
-    return Section(
-        title,
-        hint,
-        (head, [(", ".join(names), *words) for words, names in alike.items()]),
-    )
+    joined = [(", ".join(names), *words) for words, names in alike.items()]
+    return Section(title, hint, (head, joined))
 
 
 def _of(name: str) -> Say:

@@ -154,7 +154,8 @@ class ResidualSearch(CommonRate):
         """Draw trials of a selection: z (N, n), rad/s, and the failed channel (N,) or None."""
         n = self.geometries[0].n
         omega = rng.uniform(-1, 1, (count, 3)) * self.settings["max_rate"]
-        scale, zero = np.clip(rng.standard_normal((2, count, n)), -CLIP, CLIP)
+        drawn = rng.standard_normal((2, count, n))
+        scale, zero = np.clip(drawn, -CLIP, CLIP)
         failed = None
         if not cell.healthy:
             failed = rng.integers(n, size=count)

@@ -329,7 +329,8 @@ class Delay(CommonRate):
 def _ratios(contender: Contender, z: Array) -> Array:
     """Ratio of every sample of every stream, (trials, length), from z (trials, length, n)."""
     if not contender.has_memory:
-        return contender.ratios(z.reshape(-1, z.shape[2])).reshape(z.shape[:2])
+        samples = z.reshape(-1, z.shape[2])
+        return contender.ratios(samples).reshape(z.shape[:2])
     ratios = np.empty(z.shape[:2])
     for stream, ratio in zip(z, ratios, strict=True):
         contender.detector.reset()
@@ -370,7 +371,8 @@ def _waited(counts: Counts, memory: bool) -> Figures:
     if not memory and heard:
         half = Z95 / math.sqrt(heard)
         mean = counts["waited"] / heard
-        delay = Estimate(mean, mean * math.exp(-half), mean * math.exp(half))
+        low = mean * math.exp(-half)
+        delay = Estimate(mean, low, mean * math.exp(half))
     elif memory and not unheard:
         delay = mean_of(float(counts["waited"]), float(counts["squares"]), heard)
     return {

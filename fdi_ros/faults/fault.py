@@ -164,7 +164,8 @@ def fault_from(items: Mapping[str, Any]) -> Fault:
             raise FaultError(f"fault needs {name}=..., got: {words}{hint}")
     when = {name: items[name] for name in _KEYS[2:] if name in items}
     # A key of a YAML file may be anything.
-    options = {str(name): value for name, value in items.items() if name not in _KEYS}
+    own = {name: value for name, value in items.items() if name not in _KEYS}
+    options = {str(name): value for name, value in own.items()}
     try:
         kind = create_kind(items["kind"], **options)
     except FaultError as error:
@@ -301,7 +302,8 @@ class Injector:
             received[:, index] = struck.received
         n = block.z.shape[1]
         all_came = block.received is None and received[:, :n].all()
-        faulty = Block(block.stamp, z[:, :n], None if all_came else received[:, :n])
+        came = None if all_came else received[:, :n]
+        faulty = Block(block.stamp, z[:, :n], came)
         if block.acceleration is None:
             return faulty
         return replace(

@@ -229,7 +229,8 @@ class Noise(FaultKind):
         self, samples: ChannelSamples, memory: Memory, random: np.random.Generator
     ) -> None:
         """Add a normal number to every sample."""
-        drawn = random.standard_normal((int(samples.active.sum()), samples.z.shape[1]))
+        count = int(samples.active.sum())
+        drawn = random.standard_normal((count, samples.z.shape[1]))
         samples.z[samples.active] += self.size * drawn
 
 

@@ -294,7 +294,8 @@ def _judged(
             flight, vehicle=f"{flight.vehicle}, MAVLink system {seen.system}"
         )
     if reports and page:
-        name = f"{storable(path.stem)}-{hashlib.sha256(flight.path.encode()).hexdigest()[:8]}.html"
+        digest = hashlib.sha256(flight.path.encode()).hexdigest()
+        name = f"{storable(path.stem)}-{digest[:8]}.html"
         about = {"recording": flight.path, "vehicle": flight.vehicle}
         write_text(reports / name, page.html(summary, about))
         flight = replace(flight, report=storable(f"{reports.name}/{name}"))

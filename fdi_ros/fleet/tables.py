@@ -331,7 +331,8 @@ class Fleet:
         if not self.looks:
             return Verdict(Severity.GOOD, f"HEALTHY: {count}, none needs a look.")
         counts = Counter(map(_class_of, self.looks))
-        words = ", ".join(f"{counts[word]} {word}" for word in _CLASSES if counts[word])
+        met = [word for word in _CLASSES if counts[word]]
+        words = ", ".join(f"{counts[word]} {word}" for word in met)
         sentence = f"LOOK AT {len(self.looks)} of {count}: {words}."
         if self.calm:
             are = "is" if len(self.calm) == 1 else "are"
@@ -374,7 +375,8 @@ class Fleet:
         ]
         hidden = len(self.looks) - LOOKS
         more = [f"and {hidden} more, in the page and tables"] if hidden > 0 else []
-        return "".join(f"{line}\n" for line in [*self.lines(), *looks, *more])
+        lines = [*self.lines(), *looks, *more]
+        return "".join(f"{line}\n" for line in lines)
 
     def html(self, about: Mapping[str, str], notes: Sequence[str] = ()) -> str:
         """Lay out the page.

@@ -235,10 +235,11 @@ class Geometry:
     def units(self) -> tuple[tuple[int, ...], ...]:
         """Channels of each unit with at least two channels."""
         names = dict.fromkeys(filter(None, self.unit_of))
-        members = (
-            tuple(i for i in range(self.n) if self.unit_of[i] == name) for name in names
-        )
-        return tuple(unit for unit in members if len(unit) > 1)
+        members: dict[str, list[int]] = {name: [] for name in names}
+        for i, name in enumerate(self.unit_of):
+            if name:
+                members[name].append(i)
+        return tuple(tuple(unit) for unit in members.values() if len(unit) > 1)
 
     def covariance(self, variance: ArrayLike = 1.0) -> Array:
         """Return the covariance (3, 3) of the least-squares rate, (rad/s)^2.
@@ -299,7 +300,8 @@ def _rotation(mount: ArrayLike, index: int) -> Array:
         )
     if not np.isfinite(rotation).all():
         raise GeometryError(f"mount of unit {index + 1} is not finite")
-    deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    difference = rotation @ rotation.T - np.eye(3)
+    deviation = float(np.abs(difference).max())
     if deviation > 1e-3:
         raise GeometryError(
             f"mount of unit {index + 1} is no rotation: |R R' - I| is {deviation:.3g}, at most 0.001"
@@ -325,7 +327,8 @@ def are_parallel(geometry: Geometry, channels: Sequence[int]) -> bool:
     """Return whether two or more channels all measure one axis, with either sign."""
     axes = geometry.axes[list(channels)]
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    return len(channels) > 1 and bool((np.abs(axes @ axes[0]) >= PARALLEL).all())
+    is_along = np.abs(axes @ axes[0]) >= PARALLEL
+    return len(channels) > 1 and bool(is_along.all())
 
 
 def lone_pairs(geometry: Geometry) -> list[tuple[int, int]]:
@@ -381,8 +384,10 @@ def one_of_words(
         return f"any axis of {listed(units, 'or')}"
     parts = [name.rpartition(".") for name in names]
     if are_parallel(geometry, channels):
-        if all(unit and axis == parts[0][2] for unit, _, axis in parts):
-            return f"the {parts[0][2]} axis of {listed([unit for unit, *_ in parts], 'or')}"
+        same = parts[0][2]
+        if all(unit and axis == same for unit, _, axis in parts):
+            owners = [unit for unit, *_ in parts]
+            return f"the {same} axis of {listed(owners, 'or')}"
         return f"{listed(names, 'or')}, which measure one axis,"
     others = [
         name for i, name in enumerate(geometry.channel_names) if i not in channels

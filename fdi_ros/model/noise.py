@@ -77,7 +77,8 @@ class NoiseModel:
         self.nonlinearity_std = _checked("nonlinearity_std", nonlinearity_std, "", 1.0)
 
     def __repr__(self) -> str:
-        return f"NoiseModel({', '.join(f'{name}={value}' for name, value in vars(self).items())})"
+        words = [f"{name}={value}" for name, value in vars(self).items()]
+        return f"NoiseModel({', '.join(words)})"
 
     @property
     def constant(self) -> bool:
@@ -138,9 +139,11 @@ def _checked(
 ) -> Array:
     """Return a value that is at least 0, or above 0, and at most a limit."""
     array = np.array(value, dtype=np.float64)
-    within = (array > 0 if above else array >= 0) & (array <= high) & np.isfinite(array)
-    if array.ndim > 1 or array.size == 0 or not within.all():
-        wrong = array if array.ndim > 1 or array.size == 0 else array[~within].flat[0]
+    is_large = array > 0 if above else array >= 0
+    within = is_large & (array <= high) & np.isfinite(array)
+    is_misshapen = array.ndim > 1 or array.size == 0
+    if is_misshapen or not within.all():
+        wrong = array if is_misshapen else array[~within].flat[0]
         bounds = ("> 0" if above else ">= 0") + (
             "" if high == np.inf else f" and <= {high:g}"
         )
@@ -174,7 +177,8 @@ def much_noisier(
     """
     found = []
     for k, unit in enumerate(units):
-        others = noise[[i for j, other in enumerate(units) if j != k for i in other]]
+        others_of = [other for j, other in enumerate(units) if j != k]
+        others = noise[[i for other in others_of for i in other]]
         beside = float(others[np.isfinite(others)].max(initial=0.0))
         found += [
             (int(i), beside)
@@ -205,7 +209,8 @@ def noisier_words(
     found = much_noisier(noise, units)
     if not found:
         return ""
-    who = ", ".join(f"{names[i]} ({noise[i] * factor:.2g} {unit})" for i, _ in found)
+    levels = [(names[i], noise[i] * factor) for i, _ in found]
+    who = ", ".join(f"{name} ({level:.2g} {unit})" for name, level in levels)
     verb = "is" if len(found) == 1 else "are"
     others = max(beside for _, beside in found) * factor
     return f"{who} {verb} much noisier than the other units ({others:.2g} at most)"
@@ -344,9 +349,8 @@ def chi2_sf(x: Array | float, dof: int) -> Array:
         terms = [half**k / math.factorial(k) for k in range(dof // 2)]
         return np.asarray(np.exp(-half) * sum(terms), dtype=np.float64)
     terms = [half ** (k + 0.5) / math.gamma(k + 1.5) for k in range((dof - 1) // 2)]
-    return np.asarray(
-        erfc(np.sqrt(half)) + np.exp(-half) * sum(terms), dtype=np.float64
-    )
+    tail = erfc(np.sqrt(half))
+    return np.asarray(tail + np.exp(-half) * sum(terms), dtype=np.float64)
 
 
 def chi2_isf(probability: float, dof: int) -> float:
@@ -405,7 +409,8 @@ def _half_sphere(m: int) -> tuple[Array, Array]:
         return np.ones((1, 1)), np.ones(1)
     if m == 2:
         angle = np.pi * (np.arange(360) + 0.5) / 360
-        return np.column_stack([np.cos(angle), np.sin(angle)]), np.full(360, 1 / 360)
+        circle = np.column_stack([np.cos(angle), np.sin(angle)])
+        return circle, np.full(360, 1 / 360)
     nodes, weights = np.polynomial.legendre.leggauss(48)
     height = (nodes + 1) / 2
     azimuth = 2 * np.pi * (np.arange(128) + 0.5) / 128
@@ -415,7 +420,8 @@ def _half_sphere(m: int) -> tuple[Array, Array]:
         np.outer(radius, np.sin(azimuth)),
         np.outer(height, np.ones(128)),
     ]
-    return np.stack(points, axis=-1).reshape(-1, 3), np.repeat(weights / 2 / 128, 128)
+    on_sphere = np.stack(points, axis=-1).reshape(-1, 3)
+    return on_sphere, np.repeat(weights / 2 / 128, 128)
 
 
 def _union_tail(directions: Array) -> Callable[[float], float]:
@@ -516,11 +522,12 @@ def coincidences(geometry: Geometry) -> tuple[tuple[int, ...], ...]:
     third = np.linalg.svd(directions.T[triples], compute_uv=False)[:, 2:].sum(axis=1)
     for triple in triples[third < IN_PLANE].tolist():
         # Two directions define the plane.
-        known = next((found for found in sets if len(found & set(triple)) == 2), None)
+        channels = set(triple)
+        known = next((found for found in sets if len(found & channels) == 2), None)
         if known is None:
-            sets.append(set(triple))
+            sets.append(channels)
         else:
-            known |= set(triple)
+            known |= channels
     return tuple(tuple(sorted(found)) for found in sets)
 
 
