@@ -366,7 +366,8 @@ def _format_units(status: Status, worse: Mapping[str, Sequence[str]]) -> list[st
         for first, second in status.copies
     ]
     words += [_format_frozen(unit) for unit in status.units if unit.frozen]
-    words += [f"{unit.name} as a whole: {'; '.join(worse[unit.name])}" for unit in late]
+    slow = [(unit.name, "; ".join(worse[unit.name])) for unit in late]
+    words += [f"{name} as a whole: {why}" for name, why in slow]
     set_now = source_of(status.config).delays
     if late and len(set_now) == len(status.units):
         delays = [
@@ -715,7 +716,8 @@ def _input_message(line: InputStatus, more: Sequence[str]) -> tuple[Level, str]:
 
 
 def _seconds(value: float) -> str:
-    unit, seconds, _, digits = next(row for row in _TIMES if abs(value) < row[2])
+    fitting = (row for row in _TIMES if abs(value) < row[2])
+    unit, seconds, _, digits = next(fitting)
     return f"{value / seconds:.{digits}f} {unit}"
 
 

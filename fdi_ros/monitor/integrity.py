@@ -129,7 +129,8 @@ class Integrity:
         self.fill(subsets, mask, *(rest := single_losses(mask)))
         if not rest:
             return NO_LEVEL
-        x, y, z = (self.scale * subsets["level"][rest].max(axis=0)).tolist()
+        largest = subsets["level"][rest].max(axis=0)
+        x, y, z = (self.scale * largest).tolist()
         return x, y, z
 
     def prepare(self, subsets: NDArray[Any]) -> None:
@@ -244,7 +245,8 @@ def _solve(sigma: Array, prior: Array, modes: _Modes, risk: float) -> Array:
     # of all 1 - p + p x.
     for p in prior:
         by_number = np.convolve(by_number, [1 - p, p])
-    budget = risk - float(by_number[3:].sum()) - float(priors[~covered].sum())
+    of_three = float(by_number[3:].sum())
+    budget = risk - of_three - float(priors[~covered].sum())
     if budget <= 0:
         return np.full(3, np.inf)
     priors = priors[covered, None]

@@ -235,7 +235,8 @@ class Output:
         rated = ""
         if len(self):
             seconds = (int(self.stamp[-1]) - int(self.stamp[0])) / 1e9
-            rated = f", a rate in {percent(float(np.mean(self.valid)))}"
+            share = float(np.mean(self.valid))
+            rated = f", a rate in {percent(share)}"
         size = f"{len(self)} samples of {len(self.channel_names)} channels, {seconds:.3f} s"
         return f"Output({size}{rated}; {len(self.events)} changes of state)"
 

@@ -606,8 +606,9 @@ def _lasting_noise_words(own: Sequence[ChannelHealth], ratio: float) -> str:
     began = [one.noisy_from_s for one in own if one.noisy_s >= REPORTED.noisy_s]
     if not began:
         return words
-    since = f"from {min(began):.1f} s on"
-    return f"{words}, {since if min(began) >= 0.0 else f'for {-min(began):.0f} s'}"
+    first = min(began)
+    when = f"from {first:.1f} s on" if first >= 0.0 else f"for {-first:.0f} s"
+    return f"{words}, {when}"
 
 
 def _noisy_for_a_time(channels: Sequence[ChannelHealth]) -> list[Concern]:

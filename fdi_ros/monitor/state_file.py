@@ -171,7 +171,8 @@ def _parsed(saved: Any, pipeline: Pipeline) -> dict[str, Any]:
         *ambiguous,
         *saved["known"],
     }.issubset(names)
-    if not sane or not all(why and why in WHY for why in faulty.values()):
+    known = all(why and why in WHY for why in faulty.values())
+    if not sane or not known:
         raise ValueError
     state = {
         "bias": None,
@@ -276,7 +277,8 @@ def _check(
         raise RefusalError(
             f"error state {worst + 1} is {value[worst]:.3g}, expected within {limit[worst]:.3g}"
         )
-    common = float(np.abs(geometry.least_squares @ (bias + value[:n])).max())
+    of_rate = geometry.least_squares @ (bias + value[:n])
+    common = float(np.abs(of_rate).max())
     most = _FILE.plausible * turn_on_std
     if common > most:
         raise RefusalError(

@@ -445,7 +445,8 @@ def _channel(
 
 
 def _spell(spell: Any, i: int) -> NoisySpell:
-    return NoisySpell(*(spell[name][i].item() for name in spell.dtype.names))
+    fields = [spell[name][i].item() for name in spell.dtype.names]
+    return NoisySpell(*fields)
 
 
 def _named(names: Sequence[str], marked: Mask) -> tuple[str, ...]:
@@ -514,7 +515,8 @@ def _delays(guard: Detector, begun: bool) -> tuple[Array, Array]:
     value = estimator["late"][:units].copy()
     covariance = np.zeros((units, units))
     value[1:] += estimator["states"]["x"][places]
-    covariance[1:, 1:] = estimator["states"]["p"][np.ix_(places, places)]
+    of_delays = np.ix_(places, places)
+    covariance[1:, 1:] = estimator["states"]["p"][of_delays]
     covariance += np.diag(estimator["taught_delay"][:units] ** 2)
     variance = (
         np.add.outer(np.diag(covariance), np.diag(covariance))
@@ -533,7 +535,8 @@ def _units(
     names = _unit_names(geometry)
     middle = 0
     if len(late) > 2:
-        middle = int(np.argsort(late[:, 0])[(len(late) - 1) // 2])
+        in_order = np.argsort(late[:, 0])
+        middle = int(in_order[(len(late) - 1) // 2])
     off = guard.states[0]["estimator"]["late"] if measured else np.zeros(len(names))
     return tuple(
         UnitStatus(
@@ -553,10 +556,8 @@ def _frozen(core: Any, channels: Sequence[int]) -> float:
     """Time for which a unit has certainly given old values, s, 0 if none."""
     unit = mask_of(channels)
     now = core["now"]
-    seconds = (
-        float(core["last"]["stamp"] - core["health"]["run_stamp"][list(channels)].max())
-        / 1e9
-    )
+    changed = core["health"]["run_stamp"][list(channels)].max()
+    seconds = float(core["last"]["stamp"] - changed) / 1e9
     is_old = int(now["repeated"]) & unit == unit and not now["all_repeat"]
     return (
         seconds
