@@ -582,7 +582,8 @@ def _before(one: Episode) -> str:
     earlier = [step for step in one.steps[:-1] if step.channels != one.channels]
     chosen = earlier[:1]
     for step in earlier[1:][-1:]:
-        if len(step.channels) <= 1 + ROOM.channels and step.who != chosen[0].who:
+        is_small = len(step.channels) <= 1 + ROOM.channels
+        if is_small and step.who != chosen[0].who:
             chosen.append(step)
     return ", ".join(f"{step.who} from {step.at_s:.3f} s" for step in chosen)
 

@@ -150,7 +150,8 @@ class FailoverReplay(Sink):
         ``origin``: stamp from which times count, ns. None: the stamp of the first sample.
         """
         shift = 0 if origin is None or self._first is None else self._first - origin
-        done = [f"{one.words} at {(one.at + shift) / NS:.1f} s" for one in self._done]
+        times = [(one.words, (one.at + shift) / NS) for one in self._done]
+        done = [f"{words} at {at:.1f} s" for words, at in times]
         least = self._settings.min_size
         none = f"no IMU out of use (it acts on errors of {least:g} rad/s and more)"
         return f"what failover would have done if armed: {'; '.join(done) or none}"
@@ -165,7 +166,8 @@ def is_possible(channels: Sequence[str]) -> bool:
 def _is_far(rates: NDArray[np.float64]) -> NDArray[Any]:
     """Return for each sample whether any two IMUs differ by `LARGE_DIFFERENCE`; rates (N, 3 IMUs)."""
     units = rates.reshape(len(rates), -1, 3)
-    low = np.nanmin(np.where(np.isnan(units), np.inf, units), axis=1)
-    high = np.nanmax(np.where(np.isnan(units), -np.inf, units), axis=1)
+    missing = np.isnan(units)
+    low = np.nanmin(np.where(missing, np.inf, units), axis=1)
+    high = np.nanmax(np.where(missing, -np.inf, units), axis=1)
     far: NDArray[Any] = (high - low >= LARGE_DIFFERENCE).any(axis=1)
     return far

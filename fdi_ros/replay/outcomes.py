@@ -424,7 +424,8 @@ class Evaluation:
 
     def _add_effect(self, which: int, effect: Array) -> None:
         """Add errors (k, 3) of the rate that are finite and not too large."""
-        effect = effect[(np.abs(effect) < SQUARED).all(axis=1)]
+        usable = (np.abs(effect) < SQUARED).all(axis=1)
+        effect = effect[usable]
         self._effects[:, which] += float((effect**2).sum()), len(effect)
 
     def time(self, stamp: int) -> float:
@@ -519,7 +520,8 @@ def added(a: Any, b: Any) -> Any:
     if a is None:
         return b
     if isinstance(a, Mapping):
-        return {**a, **{name: added(a.get(name), value) for name, value in b.items()}}
+        sums = {name: added(a.get(name), value) for name, value in b.items()}
+        return {**a, **sums}
     if isinstance(a, list):
         return [added(x, y) for x, y in zip(a, b, strict=True)]
     return a + b

@@ -337,9 +337,8 @@ class Report(Sink):
         for curves in self._curves:
             if curves.spectrum:
                 curves.spectrum.begin_stretch()
-        self._store.add(
-            np.array([self._last]), np.full((1, len(self._store.kinds)), np.nan)
-        )
+        nothing = np.full((1, len(self._store.kinds)), np.nan)
+        self._store.add(np.array([self._last]), nothing)
 
     def add(self, block: Block, output: Output, pipeline: Pipeline) -> None:
         """Add the next samples."""
@@ -593,7 +592,8 @@ def _episode_section(
         "From the first declaration on. Size: how far the channel is from what the others give, +- its standard"
         f" error.{f' {more} more are left out.' if more else ''}"
     )
-    cards = (_card(one, scored, unit, origin) for one in story.episodes[: PAGE.cards])
+    first = story.episodes[: PAGE.cards]
+    cards = (_card(one, scored, unit, origin) for one in first)
     return Section("What happened", hint, f'<div class="cards">{"".join(cards)}</div>')
 
 

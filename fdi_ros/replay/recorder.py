@@ -187,7 +187,8 @@ class Recorder:
         before = np.vstack([self._before, told[:-1]])
         self._add_to_stretch(time, output, before)
         changes = np.flatnonzero((told != before).any(axis=1)).tolist()
-        self._tail = np.vstack([self._tail, np.column_stack([time, _stds(output)])])
+        rows = np.column_stack([time, _stds(output)])
+        self._tail = np.vstack([self._tail, rows])
         changed = set(changes)
         edges = [*dict.fromkeys([0, *changes]), len(time)]
         reasons = (
@@ -229,7 +230,9 @@ class Recorder:
                 if one is not None and (one.declares or one.start_s <= end)
             ),
         ]
-        parts = [*self._stretches, *([] if self._part is None else [self._part])]
+        parts = list(self._stretches)
+        if self._part is not None:
+            parts.append(self._part)
         stretches = [
             Stretch(
                 round(one.start_s, 9),
@@ -255,7 +258,8 @@ class Recorder:
         for one in self._open:
             if one.kind == S.AMBIGUOUS:
                 in_sets[list(one.members)] = True
-        told[(state == S.UNCHECKED) | ((state == S.SUSPECT) & ~in_sets)] = S.OK
+        is_suspect = (state == S.SUSPECT) & ~in_sets
+        told[(state == S.UNCHECKED) | is_suspect] = S.OK
         return told
 
     def _add_to_stretch(
@@ -296,10 +300,11 @@ class Recorder:
 
         std = float(self._tail[self._row_before(at), 1])
         # A set grows, shrinks, or becomes one channel.
+        ambiguous = set(np.flatnonzero(now == S.AMBIGUOUS).tolist())
         for one in [one for one in self._open if one.kind == S.AMBIGUOUS]:
             named = new[S.FAULTY] & one.members
             hiding = {i for i in one.members if now[i] in _HIDING}
-            members = named or hiding | set(np.flatnonzero(now == S.AMBIGUOUS).tolist())
+            members = named or hiding | ambiguous
             if named:
                 one.kind, one.reason = S.FAULTY, reason_of(named) or one.reason
             if named or (members and members != one.members):
@@ -313,7 +318,8 @@ class Recorder:
         )
         for group in self._by_unit(new[S.FAULTY] - taken):
             self._begin(S.FAULTY, group, at, reason_of(group), std)
-        if new[S.AMBIGUOUS] and not any(one.kind == S.AMBIGUOUS for one in self._open):
+        has_set = any(one.kind == S.AMBIGUOUS for one in self._open)
+        if new[S.AMBIGUOUS] and not has_set:
             self._begin(
                 S.AMBIGUOUS, new[S.AMBIGUOUS], at, reason_of(new[S.AMBIGUOUS]), std
             )
@@ -344,9 +350,8 @@ class Recorder:
         if self._part is None:
             # The first sample of a stretch has no interval.
             usual[:2] = np.inf
-        self._interval = (
-            float(steps[-1]) if len(time) > 1 or self._part is not None else np.inf
-        )
+        goes_on = len(time) > 1 or self._part is not None
+        self._interval = float(steps[-1]) if goes_on else np.inf
         return time[(steps > _HOLES.least) & (steps > _HOLES.intervals * usual)]
 
     def _row_before(self, at: float) -> int:
@@ -399,11 +404,13 @@ class Recorder:
         """Group channels by unit. A channel without a unit is a group of its own."""
         groups = [set(unit) & channels for unit in self._geometry.units]
         left = channels - set().union(*groups)
-        return [*(group for group in groups if group), *({i} for i in sorted(left))]
+        alone = [{i} for i in sorted(left)]
+        return [*filter(None, groups), *alone]
 
     def _is_over(self, one: _Open, now: ReducedStates) -> bool:
         if one.kind == S.AMBIGUOUS:
-            return all(now[i] not in (S.AMBIGUOUS, *_HIDING) for i in one.members)
+            lasting = (S.AMBIGUOUS, *_HIDING)
+            return all(now[i] not in lasting for i in one.members)
         return all(now[i] != one.kind for i in one.members)
 
     def _take(
@@ -649,7 +656,8 @@ class Batches:
                 ]
             )
             self._width *= 2
-        number = np.maximum(((time - self._begin) / self._width).astype(np.intp), 0)
+        passed = (time - self._begin) / self._width
+        number = np.maximum(passed.astype(np.intp), 0)
         number = np.minimum(number, _BATCHES.batches - 1)
         for k, values in enumerate((None, error, error**2)):
             self._sums[k] += np.bincount(number, values, _BATCHES.batches)
@@ -734,9 +742,9 @@ def _standard_error(means: Array, scatter: float, samples: float) -> float:
         means = np.array(
             [part.mean() for part in np.array_split(means, _BATCHES.merged)]
         )
-    by_batch = (
-        float(means.var(ddof=1)) / len(means) if len(means) >= _BATCHES.fewest else 0.0
-    )
+    by_batch = 0.0
+    if len(means) >= _BATCHES.fewest:
+        by_batch = float(means.var(ddof=1)) / len(means)
     return math.sqrt(max(by_sample, by_batch))
 
 

@@ -93,7 +93,8 @@ def join_noise(
     left = list(episodes)
     while left:
         one = left.pop(0)
-        end = stretches[one.stretch - 1].end_s if one.stretch <= len(stretches) else 0.0
+        has_stretch = one.stretch <= len(stretches)
+        end = stretches[one.stretch - 1].end_s if has_stretch else 0.0
         times = _noise_after(one, noisy, unit_of)
         if not times:
             joined.append(one)
@@ -164,7 +165,8 @@ def _noisy_unit(
     """
     unit = unit_of[times[0].channel]
     shown = {time.channel for time in times}
-    shown |= {name for one in run for name in one.channels if unit_of[name] == unit}
+    in_sets = {name for one in run for name in one.channels}
+    shown |= {name for name in in_sets if unit_of[name] == unit}
     whole = _whole(run)
     last = max(until, run[-1].end_s)
     whole = replace(

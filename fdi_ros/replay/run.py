@@ -229,7 +229,8 @@ class Judge(Walk):
         """Pass a piece without a long gap through the monitor, with the faults injected."""
         block = self.pipeline.arranged(block)
         if len(block) > 1:
-            self._intervals.append((float(np.median(np.diff(block.stamp))), len(block)))
+            interval = float(np.median(np.diff(block.stamp)))
+            self._intervals.append((interval, len(block)))
         there = np.isfinite(block.z)
         for i in np.flatnonzero(there.any(axis=0)).tolist():
             self._delivered[i] = block.stamp[there[:, i]][-1]
@@ -455,7 +456,8 @@ class Judge(Walk):
         if not self._intervals:
             return None
         step, count = np.array(sorted(self._intervals)).T
-        return float(1e9 / step[np.searchsorted(np.cumsum(count), count.sum() / 2)])
+        middle = np.searchsorted(np.cumsum(count), count.sum() / 2)
+        return float(1e9 / step[middle])
 
 
 def _joined(

@@ -84,7 +84,8 @@ class SpanMeans:
             self._width *= 2
         known = np.isfinite(values) & (np.abs(values) < SQUARED)
         known &= ~np.isin(state, _UNUSED)
-        span = np.maximum((time - self._begin) / self._width, 0.0).astype(np.intp)
+        passed = (time - self._begin) / self._width
+        span = np.maximum(passed, 0.0).astype(np.intp)
         for i in range(self._geometry.n):
             own = known[:, i]
             self._counts[i] += np.bincount(span[own], minlength=SPANS.most)

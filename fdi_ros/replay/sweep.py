@@ -253,7 +253,8 @@ def _seconds(block: Block) -> Array:
 
 def _rows_at(block: Block, at: float, watch: float) -> slice:
     """Return the samples from a time on, s from the first sample, for ``watch`` s."""
-    return slice(*np.searchsorted(_seconds(block), (at, at + watch)).tolist())
+    ends = np.searchsorted(_seconds(block), (at, at + watch))
+    return slice(*ends.tolist())
 
 
 # One fault, from the state of the monitor at its onset
@@ -336,7 +337,8 @@ def _memory_of(detector: Detector) -> dict[int, NDArray[Any]]:
     """Return the memory of a detector by the bits of the set of channels."""
     rows = detector.bank["row"][0]
     memory = _bytes_of(detector.states)
-    return {int(mask): memory[rows[mask]].copy() for mask in np.flatnonzero(rows >= 0)}
+    masks = np.flatnonzero(rows >= 0)
+    return {int(mask): memory[rows[mask]].copy() for mask in masks}
 
 
 def judged_with(pipeline: Pipeline, onset: Onset, fault: Fault) -> Output:
@@ -378,9 +380,8 @@ def try_faults(config: Config, onset: Onset, channel: int, plan: Plan) -> list[T
             [plan.seed, zlib.crc32(f"{name} {swept.family} {onset.at:.6f}".encode())]
         )
         # All sizes share sign and seed, so that only the size differs.
-        fault = swept.fault(
-            name, start, float(rng.choice([-1.0, 1.0])), int(rng.integers(2**31))
-        )
+        sign = float(rng.choice([-1.0, 1.0]))
+        fault = swept.fault(name, start, sign, int(rng.integers(2**31)))
         output = judged_with(pipeline, onset, fault)
         trials.append(
             Trial(
@@ -472,7 +473,8 @@ def sweep(
         raise FaultError(
             "no fault can be tried: all are of accelerometers, and none are judged in this recording"
         )
-    times = _times([baseline for _, baseline in baselines], baselines[0][0].block, plan)
+    block = baselines[0][0].block
+    times = _times([baseline for _, baseline in baselines], block, plan)
     lead = max(
         [
             LEAD,
@@ -543,7 +545,8 @@ def _times(baselines: Sequence[Baseline], block: Block, plan: Plan) -> list[floa
         (float(seconds[rows.start]), float(seconds[rows.stop - 1]))
         for rows in pieces(block.stamp)
     )
-    windows = [(max(low, begins), min(high, end) - plan.within) for low, high in spans]
+    inside = [(max(low, begins), min(high, end)) for low, high in spans]
+    windows = [(low, high - plan.within) for low, high in inside]
     windows = [(low, high) for low, high in windows if high > low]
     if not windows:
         gaps = (

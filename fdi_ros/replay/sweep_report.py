@@ -121,7 +121,8 @@ def _quantiles(delays: Sequence[float], trials: int, within: float) -> Delays:
         return Delays(math.nan, math.nan)
     known = sorted(delay for delay in delays if delay <= within)
     every = [*known, *[math.inf] * (trials - len(known))]
-    return Delays(*(every[math.ceil(level * trials) - 1] for level in (0.5, WANTED)))
+    ranks = [math.ceil(level * trials) for level in (0.5, WANTED)]
+    return Delays(*(every[rank - 1] for rank in ranks))
 
 
 def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
@@ -362,7 +363,8 @@ def _from(lines: Sequence[Line], named: bool) -> str:
     count = line.count(named)
     size = f"{line.swept.size:g} {line.swept.unit}".rstrip()
     interval = share(count, line.trials)
-    of = f"({count} of {line.trials}, {percent(interval.low)} to {percent(interval.high)})"
+    span = f"{percent(interval.low)} to {percent(interval.high)}"
+    of = f"({count} of {line.trials}, {span})"
     return (
         f"from {size} {of}"
         if found
@@ -461,12 +463,8 @@ def _summary(results: Sequence[Subject], plan: Plan) -> list[str]:
         ]
         verdict = verdict_lines(one, plan)
         # With several monitors the table side by side has these figures.
-        lines += [
-            f"{before}{line}."
-            for line in (
-                verdict if len(results) == 1 else [*verdict[:1], *verdict[-2:]]
-            )
-        ]
+        shown_ones = verdict if len(results) == 1 else [*verdict[:1], *verdict[-2:]]
+        lines += [f"{before}{line}." for line in shown_ones]
     return [*lines[:1], smallest_hint(plan), *lines[1:]]
 
 

@@ -225,7 +225,8 @@ def _faulty_sentences(
     lasting = _without_brief_sets(faulty)
     heat = [words for one in lasting if (words := warming_words(one, unit))]
     sentences += heat[: REPORTED.concerns]
-    others = dict.fromkeys(one.who for one in lasting[1:] if one.who != first.who)
+    others = dict.fromkeys(one.who for one in lasting[1:])
+    others.pop(first.who, None)
     if others:
         sentences.append(f"Also {_other_names(list(others))}.")
     sentences += [one.sentence for one in set_clocks(judgement)]
@@ -418,10 +419,13 @@ def _size_sentences(one: Episode, unit: Unit) -> list[str]:
     (common, *others) = dict.fromkeys(by_axis.values())
     if common and not others and len(by_axis) > 1:
         return [f"Each axis {common}."]
-    words = [f"{axis} {words}".strip() for axis, words in by_axis.items() if words]
+    measured = {axis: words for axis, words in by_axis.items() if words}
+    words = [f"{axis} {how}".strip() for axis, how in measured.items()]
     if not words:
         return ["Its error is too small to measure."]
-    return [f"Its error: {'; '.join(words)}." if len(words) > 1 else f"It {words[0]}."]
+    if len(words) == 1:
+        return [f"It {words[0]}."]
+    return [f"Its error: {'; '.join(words)}."]
 
 
 def _size_words(size: Size, unit: Unit) -> str:

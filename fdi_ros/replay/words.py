@@ -132,11 +132,13 @@ def unchecked_words(channels: Sequence[ChannelResult]) -> str:
         if not since[-1]:
             when = "from the start"
         else:
-            first, last = (f"{at:.1f} s" for at in (since[0], since[-1]))
+            first = f"{since[0]:.1f} s"
+            last = f"{since[-1]:.1f} s"
             when = f"from {first} on"
             when += f", the last from {last} on" if last != first else ""
         names = listed(short_names([one.name for one in group]))
-        words.append(f"{names} {state} {when}{f' ({reason})' if reason else ''}")
+        why = f" ({reason})" if reason else ""
+        words.append(f"{names} {state} {when}{why}")
     return "; ".join(words)
 
 
@@ -301,7 +303,8 @@ def summary_text(summary: Summary, unit: Unit = RADIANS) -> str:
         _episodes(summary.story, bool(scores.faults), unit),
         f"\n{section_text(health)}" if health.content else "",
         *(f"\n{section_text(section)}" for section in fault_sections(scores, unit)),
-        *(f"note: {line}\n" for line in (*summary.monitor.degraded, *notes(summary))),
+        *(f"note: {line}\n" for line in summary.monitor.degraded),
+        *(f"note: {line}\n" for line in notes(summary)),
     ]
     return "".join(parts)
 
@@ -468,7 +471,8 @@ def _episodes(story: Story, scored: bool, unit: Unit) -> str:
             f"       {title}: {words}\n"
             for title, words in detail_words(one, unit, scored)
         ]
-    lines += [f"  {len(first) + k}. {words}\n" for k, words in enumerate(folded, 1)]
+    numbered = enumerate(folded, len(first) + 1)
+    lines += [f"  {k}. {words}\n" for k, words in numbered]
     if folded and not first:
         lines.insert(0, "\nwhat happened\n")
     more = len(shown_ones) - len(first) + story.more
