@@ -199,7 +199,8 @@ def _check_forces(z: Array, units: Sequence[str], unit: Int, axes: Array) -> Non
     forces = np.array([rows[:, own] @ inverse.T for own, inverse in pairs])
     sizes = np.linalg.norm(forces, axis=2)
     size = np.median(sizes, axis=1)
-    others = np.array([np.median(np.delete(size, k)) for k in range(len(size))])
+    units_there = range(len(size))
+    others = np.array([np.median(np.delete(size, k)) for k in units_there])
     ratio = size / np.maximum(others, 1e-9)
     odd = int(np.abs(np.log(np.maximum(ratio, 1e-9))).argmax())
     name = units[whole[odd]]

@@ -60,9 +60,8 @@ def check_agreement(data: Data, nominal: Geometry, unknown: Sequence[int] = ()) 
     if len(means) < TURNS.least_windows:
         return
     _check_units(means, nominal, unknown)
-    rate = np.median(
-        np.abs(means) / np.maximum(np.linalg.norm(nominal.axes, axis=1), 1e-9), axis=1
-    )
+    length = np.linalg.norm(nominal.axes, axis=1)
+    rate = np.median(np.abs(means) / np.maximum(length, 1e-9), axis=1)
     moving = means[rate >= TURNS.least_rotation / 2]
     if len(moving) >= TURNS.least_windows and not unknown:
         _check_response(moving, nominal)
@@ -100,7 +99,8 @@ def _check_units(means: Array, nominal: Geometry, unknown: Sequence[int]) -> Non
     ]
     agree = alike & np.array(along_same_axes)
     most = np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
-    odd = next((k for k in range(len(turns.units)) if k not in most), None)
+    others = (k for k in range(len(turns.units)) if k not in most)
+    odd = next(others, None)
     if odd is None:
         return
     if alike[odd, most].all():
@@ -150,7 +150,8 @@ def _have_one_scale(turns: _Turns) -> NDArray[np.bool_]:
     covariances = [np.cov(turns.means[:, unit].T) for unit in turns.units]
     variances = [np.linalg.eigvalsh(one) for one in covariances]
     along = np.sqrt(np.maximum(variances, 1e-18))
-    least = np.maximum(turns.ratio, (along[:, None] / along[None]).max(axis=2))
+    ratios = along[:, None] / along[None]
+    least = np.maximum(turns.ratio, ratios.max(axis=2))
     is_alike = least > AGREEMENT.response
     return is_alike & is_alike.T
 
@@ -177,8 +178,9 @@ def _other_axes(turns: _Turns, nominal: Geometry, odd: int, most: Int) -> str:
             f" ({percent(max(*shares, 0.0))} shared): its mount in the config is wrong, it is not"
             f" on the same body, or its clock is off by seconds{doubt}"
         )
+    likeliest = SIGNED_AXES[int(np.argmax(shares))]
     return (
-        f"{turns.names[odd]} {_wrong_axes(SIGNED_AXES[int(np.argmax(shares))])},"
+        f"{turns.names[odd]} {_wrong_axes(likeliest)},"
         f" unlike {_joined(turns, most)}{doubt}: correct its driver or mount, {_OR_EXCLUDE}"
     )
 
@@ -204,7 +206,8 @@ def _wrong_axes(signed: Array) -> str:
         "a left turn as a right turn",
     )
     if (np.diag(signed) != 0.0).all():
-        return " and ".join(f"shows {seen[a]}" for a in range(3) if signed[a, a] < 0.0)
+        reversed_ones = [a for a in range(3) if signed[a, a] < 0.0]
+        return " and ".join(f"shows {seen[a]}" for a in reversed_ones)
     kind = "has mirrored axes" if np.linalg.det(signed) < 0 else "has swapped axes"
     return f"{kind}: its channels x, y, z are {', '.join(_axes_of(signed))} of its mount as configured"
 
@@ -267,9 +270,8 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
         if not spans_space(axes[three]):
             continue
         gain = np.linalg.solve(axes[three].T, axes[i])
-        seen = float(
-            np.sqrt(np.maximum(gain @ square[np.ix_(three, three)] @ gain, 0.0))
-        )
+        power = gain @ square[np.ix_(three, three)] @ gain
+        seen = float(np.sqrt(np.maximum(power, 0.0)))
         if seen < TURNS.least_rotation:
             return []
         response = float(gain @ square[three, i]) / seen**2
@@ -387,7 +389,8 @@ def _against(first: Array, unit: Array) -> Mount:
     nearest = min(SIGNED_AXES, key=lambda axes: float(np.linalg.norm(axes - rotation)))
     off = angle_of(nearest.T @ rotation)
     if off > max(TURNS.square, MOUNT_ERRORS.sigmas * doubt):
-        words = f"turned by {np.degrees(angle_of(rotation)):.1f} +- {np.degrees(error):.1f} deg"
+        angle = np.degrees(angle_of(rotation))
+        words = f"turned by {angle:.1f} +- {np.degrees(error):.1f} deg"
         return Mount(words, shared, np.round(rotation, 6), 0.0, error)
     error = max(error, doubt)
     along = ", ".join(

@@ -57,9 +57,9 @@ class Data:
         )  # (N,) since the first sample
         self.duration = float(self.seconds[-1]) if len(self.stamp) else 0.0  # s
         # Usual time from sample to sample, s.
-        self.step = (
-            float(np.median(np.diff(self.stamp))) * 1e-9 if len(self.stamp) > 1 else 0.0
-        )
+        self.step = 0.0
+        if len(self.stamp) > 1:
+            self.step = float(np.median(np.diff(self.stamp))) * 1e-9
 
     def slow_rates(self) -> Array:
         """Return rates (W, n) averaged over complete windows, less their medians."""
@@ -69,12 +69,8 @@ class Data:
         # A window at the end, or beside a gap, may hold few samples.
         complete = np.logical_and.reduceat(np.isfinite(self.z).all(axis=1), starts)
         good = complete & (counts >= 0.5 * np.median(counts))
-        means = (
-            np.add.reduceat(np.where(np.isfinite(self.z), self.z, 0.0), starts, axis=0)[
-                good
-            ]
-            / counts[good, None]
-        )
+        finite = np.where(np.isfinite(self.z), self.z, 0.0)
+        means = np.add.reduceat(finite, starts, axis=0)[good] / counts[good, None]
         return np.asarray(means - np.median(means, axis=0)) if len(means) else means
 
 
@@ -226,7 +222,7 @@ def resampled(data: Data, delay: Array) -> tuple[Array, Array]:
         alike = [
             j
             for j in left
-            if delay[j] == delay[i] and (there[:, j] == there[:, i]).all()
+            if delay[j] == delay[i] and np.array_equal(there[:, j], there[:, i])
         ]
         left = [j for j in left if j not in alike]
         rows = np.flatnonzero(there[:, i])
@@ -269,7 +265,7 @@ def lagrange_weights(knots: Array, x: Array, usual: float) -> tuple[Int, Array]:
     )
     # Each with itself gives the factor 1.
     apart = around[:, :, None] - around[:, None, :] + np.eye(POINTS)
-    from_x = np.where(
-        np.eye(POINTS, dtype=bool), 1.0, (x[:, None] - around)[:, None, :]
-    )
-    return np.where(there, first, -1), np.asarray((from_x / apart).prod(axis=2))
+    own = np.eye(POINTS, dtype=bool)
+    from_x = np.where(own, 1.0, (x[:, None] - around)[:, None, :])
+    weights = np.asarray((from_x / apart).prod(axis=2))
+    return np.where(there, first, -1), weights

@@ -237,7 +237,8 @@ def _stamp_delays(found: StateEstimate, sensors: Priors) -> tuple[StampDelay, ..
     for k in range(1, sensors.units):
         unit = tuple(np.flatnonzero(sensors.unit == k).tolist())
         first = unit[0]
-        delay, std = float(found.delay[first]), float(found.delay_std[first])
+        delay = float(found.delay[first])
+        std = float(found.delay_std[first])
         delays.append(StampDelay(unit, delay, std))
     return tuple(delays)
 
@@ -306,7 +307,8 @@ def _as_monitored(
     z = block.z.copy()
     received = block.delivered.copy()
     still = np.isfinite(data.z) & (np.abs(found.delay) < NOT_SHIFTED)
-    z[:, used] = np.where(still, data.z, resampled(data, found.delay)[0])
+    shifted, _ = resampled(data, found.delay)
+    z[:, used] = np.where(still, data.z, shifted)
     # The value of another instant is no substitute.
     received[:, used] = np.isfinite(z[:, used])
     forces = None
@@ -452,11 +454,11 @@ def _watch(
     ]
     of_forces = np.arange(len(names)) >= gyros
     for half in (~of_forces, of_forces):
-        doubted = np.asarray((among & half).any(axis=1))
-        runs += [
-            (np.flatnonzero((among & half)[slice(*run)].any(axis=0)).tolist(), run)
-            for run in flag_runs(doubted)
-        ]
+        of_half = among & half
+        doubted = np.asarray(of_half.any(axis=1))
+        for run in flag_runs(doubted):
+            channels = of_half[slice(*run)].any(axis=0)
+            runs.append((np.flatnonzero(channels).tolist(), run))
     seconds = (stamp - stamp[0]) * 1e-9
     spans = [
         Span(tuple(channels), float(seconds[first]), float(seconds[end - 1]))
@@ -468,14 +470,16 @@ def _watch(
 def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data:
     """Leave out short faults of few channels, and refuse lasting ones."""
     # A larger set says too little about which channels are right.
-    clear = [span for span in faults if len(span.channels) <= (1 / 3) * len(names)]
+    few = (1 / 3) * len(names)
+    clear = [span for span in faults if len(span.channels) <= few]
     z = data.z.copy()
     share = np.zeros(len(names))
     for span in clear:
         share[list(span.channels)] += (span.end - span.start) / data.duration
         # A fault may have begun 1 s before; most are declared sooner.
         rows = (data.seconds >= span.start - 1.0) & (data.seconds <= span.end)
-        z[np.ix_(np.flatnonzero(rows), np.array(span.channels))] = np.nan
+        struck = np.ix_(np.flatnonzero(rows), np.array(span.channels))
+        z[struck] = np.nan
     if share.max() > NEEDED_DATA.faulty:
         group = [names[i] for i in np.flatnonzero(share > NEEDED_DATA.faulty)]
         first = next(span for span in clear if int(share.argmax()) in span.channels)

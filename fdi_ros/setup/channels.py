@@ -51,7 +51,8 @@ class ChannelFit:
         """(n,) scale factor relative to nominal."""
         each = found.axes_covariance.reshape(n, 3, n, 3)
         along = axes / length[:, None]
-        square = np.einsum("ia,iab,ib->i", along, each[range(n), :, range(n)], along)
+        own = each[range(n), :, range(n)]
+        square = np.einsum("ia,iab,ib->i", along, own, along)
         self.factor_error = np.sqrt(np.maximum(square, 0))
         """(n,) standard errors of the scale factors."""
         across = (self.axes_std**2).sum(axis=1) - self.factor_error**2

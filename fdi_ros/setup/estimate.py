@@ -202,8 +202,10 @@ class StateEstimate:
         apart = np.kron(projector(self.axes), np.eye(3))
         left = apart @ self.axes_covariance @ apart
         count = 3 * (len(self.axes) - 3)
-        rms = float(np.sqrt(max(float(np.trace(left)) / count, 1e-18)))
-        return rms, float(np.sqrt(2.0 * np.sum(left * left)) / count / (2.0 * rms))
+        mean = float(np.trace(left)) / count
+        rms = float(np.sqrt(max(mean, 1e-18)))
+        spread = np.sqrt(2.0 * np.sum(left * left)) / count
+        return rms, float(spread / (2.0 * rms))
 
 
 def estimate(data: Data, sensors: Priors) -> StateEstimate:
@@ -240,7 +242,8 @@ def estimate(data: Data, sensors: Priors) -> StateEstimate:
         priors = _widened(sensors, axes) if number >= _PASSES.trusting else sensors
     assert walk is not None
     covariance = _constant_covariance(one, shown, found)
-    delay_std = np.append(0.0, np.sqrt(np.diag(covariance)[3 * n : one.motion]))
+    of_delays = np.diag(covariance)[3 * n : one.motion]
+    delay_std = np.append(0.0, np.sqrt(of_delays))
     # Interpolation reduces white noise; the factor restores the residual.
     kept = np.sqrt(blocks.white)
     return StateEstimate(
@@ -407,7 +410,8 @@ class _Pass:
     def curve_of(self, found: Smoothed) -> Array:
         """Biases (K, n) over time, rad/s."""
         trend = found.constant[-found.curve.shape[1] :]
-        return np.asarray(found.curve + np.outer(self.times - self.times.mean(), trend))
+        since_middle = self.times - self.times.mean()
+        return np.asarray(found.curve + np.outer(since_middle, trend))
 
     def _by_window(self, first: Array, second: Array) -> Array:
         """Sum (W, l, r) products over the blocks of every window."""
@@ -451,9 +455,12 @@ class _Pass:
             return found
         mean = np.add.reduceat(rate, blocks.start, axis=0) / REST_BLOCKS
         limit = SAME_REST * np.sqrt(noise / REST_BLOCKS + REST_STD**2)
-        found &= (np.abs(mean - np.median(mean[found], axis=0)) < limit).all(axis=1)
+        apart = np.abs(mean - np.median(mean[found], axis=0))
+        found &= (apart < limit).all(axis=1)
         # Noise may hide the beginning of a motion: drop rest windows beside motion.
-        found &= np.append(True, found[:-1]) & np.append(found[1:], True)
+        before = np.append(True, found[:-1])
+        after = np.append(found[1:], True)
+        found &= before & after
         return found & (float(found.sum()) * REST_BLOCKS * blocks.length >= LONG_TIME)
 
     def _find_evidence(
@@ -478,9 +485,8 @@ class _Pass:
         a = information(variance, axes)
         a[self.still] = _at_rest(variance[self.still], axes)
         expected = (sensors.delay - delay)[1:]
-        start = np.concatenate(
-            [np.zeros(n), (sensors.axes - axes).ravel(), expected, np.zeros(n)]
-        )
+        of_axes = (sensors.axes - axes).ravel()
+        start = np.concatenate([np.zeros(n), of_axes, expected, np.zeros(n)])
         prior = np.concatenate([prior, np.full(n, BIAS_RATE.prior)])
         flat = coefficients.reshape(-1, n * BASE)
 
@@ -520,7 +526,8 @@ class _Pass:
             products = of_windows @ moments[group].reshape(-1, BASE * BASE)
             products = products.reshape(n, n, BASE, BASE).transpose(0, 2, 1, 3)
             normal[k] = flat @ products.reshape(n * BASE, n * BASE) @ flat.T
-            weighted = (a[group] @ np.swapaxes(cross[group], 1, 2)).sum(axis=0)
+            of_group = np.swapaxes(cross[group], 1, 2)
+            weighted = (a[group] @ of_group).sum(axis=0)
             right[k] = flat @ weighted.reshape(-1)
         since = (self.middle - self.middle.mean())[:, None, None]
         rates = since * normal[:, :n]
@@ -595,7 +602,8 @@ class _Pass:
                 blocks.mean[rows],
             )
             means = t.reshape(len(chosen), -1, SUBS, n).mean(axis=2)
-            short, long = (part.var(axis=1, ddof=1).sum(axis=0) for part in (t, means))
+            short = t.var(axis=1, ddof=1).sum(axis=0)
+            long = means.var(axis=1, ddof=1).sum(axis=0)
             found[regime] = np.maximum(SUBS * long / np.maximum(short, 1e-30), 1.0)
         return found
 
@@ -651,10 +659,8 @@ def coefficients_of(sensors: Priors, axes: Array) -> tuple[Array, Array]:
 def misfit(of: NormalEquations, found: Smoothed) -> float:
     """Return the scatter of single windows about the constants over its expectation."""
     n = of.n
-    x = (
-        np.hstack([found.curve, np.tile(found.constant, (len(of.normal), 1))])
-        / of.prior
-    )
+    constants = np.tile(found.constant, (len(of.normal), 1))
+    x = np.hstack([found.curve, constants]) / of.prior
     residual = (of.right - np.einsum("kij,kj->ki", of.normal, x))[:, n:]
     covariance = found.constant_covariance / np.outer(of.prior[n:], of.prior[n:])
     shown = float(np.einsum("ki,ij,kj->", residual, covariance, residual))

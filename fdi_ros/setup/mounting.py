@@ -175,7 +175,8 @@ def loss(geometry: Geometry, noise: NoiseModel, lost: tuple[int, ...]) -> Loss:
     axes = geometry.axes[kept]
     if np.linalg.matrix_rank(axes, tol=1e-2) < 3:
         return Loss(lost)
-    gdop = float(np.sqrt(np.trace(np.linalg.inv(axes.T @ axes))))
+    inverse = np.linalg.inv(axes.T @ axes)
+    gdop = float(np.sqrt(np.trace(inverse)))
     information = (axes.T / noise.noise_std[kept] ** 2) @ axes
     std = np.sqrt(np.diag(np.linalg.inv(information)))
     try:
@@ -311,9 +312,9 @@ def pair_lines(result: Mounting) -> list[str]:
             why = f"{names[i]} and {names[j]} measure the same axis"
         lines.append(f"{why}: a fault of either is detected, but not which one")
     hard = "{} and {} are almost indistinguishable (|rho| {:.3f})"
-    lines += [
-        hard.format(names[i], names[j], abs(g.rho[i, j])) for i, j in result.similar
-    ]
+    for i, j in result.similar:
+        rho = abs(g.rho[i, j])
+        lines.append(hard.format(names[i], names[j], rho))
     blind = np.flatnonzero(~g.detectable).tolist()
     lines += [
         f"a fault of {names[i]} is never detected: no other channel checks it"

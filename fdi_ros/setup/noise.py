@@ -75,7 +75,8 @@ def gains(variance: Array, axes: Array) -> Array:
 def variances(covariance: Array, axes: Array) -> Array:
     """Return variances (W, n) of channels from covariances (W, n, n) of windows, (rad/s)^2."""
     start = np.einsum("wab,ab->w", covariance, projector(axes)) / (len(axes) - 3)
-    v = np.repeat(np.maximum(start, LEAST_VARIANCE)[:, None], len(axes), axis=1)
+    of_all = np.maximum(start, LEAST_VARIANCE)
+    v = np.repeat(of_all[:, None], len(axes), axis=1)
     for _ in range(25):
         a = information(v, axes)
         # The diagonal of A S A, and A is symmetric.
@@ -84,12 +85,9 @@ def variances(covariance: Array, axes: Array) -> Array:
         ratio = np.where(checked > 1e-6, t * v / np.maximum(checked, 1e-6), 1.0)
         v = v * np.clip(ratio, 0.1, 10.0)
         # Less than the monitor believes of one channel is a split that nothing decides.
-        v = np.maximum(
-            v,
-            np.maximum(
-                QUIETEST * np.exp(np.log(v).mean(axis=1))[:, None], LEAST_VARIANCE
-            ),
-        )
+        geometric_mean = np.exp(np.log(v).mean(axis=1))
+        least = np.maximum(QUIETEST * geometric_mean[:, None], LEAST_VARIANCE)
+        v = np.maximum(v, least)
     return v
 
 
@@ -168,7 +166,8 @@ def levels(covariance: Array, there: Mask, axes: Array) -> Array:
             )
         )
         # The geometric mean of the channels: one that is always noisy hides nothing.
-        found[known] = np.exp(np.nanmean(logs - np.nanmedian(logs, axis=0), axis=1))
+        relative = logs - np.nanmedian(logs, axis=0)
+        found[known] = np.exp(np.nanmean(relative, axis=1))
     return found
 
 
@@ -211,7 +210,8 @@ def find_floor(covariance: Array, count: Int, there: Mask, axes: Array) -> Floor
             )
             # Redundancy shows A_ii v_i of the variance. The rest follows from other
             # channels.
-            shown = np.maximum(np.diag(information(v, axes[columns])) * v, 0.1)
+            own = np.diag(information(v, axes[columns]))
+            shown = np.maximum(own * v, 0.1)
             chosen = alike[columns]
             which = columns[chosen]
             sums[which] += samples * v[chosen]

@@ -89,7 +89,8 @@ def measure(
     signals = np.zeros((len(along), n, TERMS))
     signals[:, :, 0] = 1.0
     signals[:, :, 1:4] = rate[:, None, :]
-    signals[:, :, 4] = ((time - time.mean()) / max(np.ptp(time), 1.0))[:, None]
+    relative = (time - time.mean()) / max(np.ptp(time), 1.0)
+    signals[:, :, 4] = relative[:, None]
     signals[:, :, 5] = np.abs(along)
     signals[:, :, 6] = along * np.abs(along) / largest
     normal = np.zeros((n, TERMS, n, TERMS))

@@ -145,7 +145,8 @@ def delays_of(config: Config, found: StateEstimate) -> Array:
     delay = np.zeros(len(used))
     delay[used] = found.delay
     of_units = delay.reshape(-1, 3)
-    return np.repeat(of_units[np.arange(len(of_units)), np.abs(of_units).argmax(1)], 3)
+    largest = np.abs(of_units).argmax(1)
+    return np.repeat(of_units[np.arange(len(of_units)), largest], 3)
 
 
 def turning_of(found: StateEstimate) -> tuple[Array, Array]:
@@ -179,7 +180,8 @@ def _smooth(values: Array) -> Array:
 
 def _cross(vectors: Array) -> Array:
     """Matrices (B, 3, 3) of the vector product with vectors (B, 3)."""
-    return np.asarray(np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2))
+    columns = np.cross(vectors[:, None, :], np.eye(3))
+    return np.asarray(columns.swapaxes(1, 2))
 
 
 @dataclass(frozen=True)
@@ -219,7 +221,8 @@ def _windows_of(
     signals = np.zeros((len(mean), 3, STATE_COUNT))
     signals[:, :, :3] = np.eye(3)
     signals[:, :, 3:6] = turning / FORCE.natural
-    signals[:, :, 6:15] = np.kron(np.eye(3), mean[:, None, :]).reshape(-1, 3, 9)
+    of_mean = np.kron(np.eye(3), mean[:, None, :])
+    signals[:, :, 6:15] = of_mean.reshape(-1, 3, 9)
     signals[:, :, 15] = np.gradient(mean, blocks.seconds, axis=0)
     usable = np.isfinite(signals).all(axis=2) & np.isfinite(difference)
     good: Mask = np.asarray(usable.all(axis=1))

@@ -316,9 +316,9 @@ def _unknown(result: Calibration, body_frame: str, unit: Unit) -> Iterator[Findi
         words = "nonlinearity: not measured; turn faster, both ways about every axis"
         yield Finding(Role.UNKNOWN, "nonlinearity", words)
     if late := [d for d in result.delays if d.error > SHOWN_DELAY]:
-        names = list(
-            dict.fromkeys(result.names[d.channels[0]].rpartition(".")[0] for d in late)
-        )
+        first_ones = [result.names[d.channels[0]] for d in late]
+        units = [name.rpartition(".")[0] for name in first_ones]
+        names = list(dict.fromkeys(units))
         worst = max(d.error for d in late)
         words = f"delays of {', '.join(names)} are known only to {1e3 * worst:.1f} ms: turn back and forth faster"
         yield Finding(Role.UNKNOWN, "delay", words, names, None, worst, SHOWN_DELAY)
@@ -1140,7 +1140,9 @@ def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Secti
     found = result.estimate
     names = result.names
     times = found.blocks.time
-    half = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    half = 0.0
+    if len(times) > 1:
+        half = 0.5 * float(np.median(np.diff(times)))
     rests = [
         {
             "type": "rect",
@@ -1169,7 +1171,8 @@ def _courses(refused: str, result: Calibration | None, unit: Unit) -> list[Secti
             {"name": name, "line": {"color": colour_of(i), "width": 1.2}, **look}
             for i, name in enumerate(names)
         ]
-        values = [list(map(drawn, column * unit.factor)) for column in y[::step].T]
+        columns = (y[::step] * unit.factor).T
+        values = [list(map(drawn, column)) for column in columns]
         return [
             {**line, "x": at, "y": column}
             for line, column in zip(lines, values, strict=True)

@@ -137,7 +137,8 @@ def _of_all_sizes(isolated: Mapping[float, tuple[int, int]]) -> tuple[int, int]:
 
 def times_words(declared: Mapping[str, float]) -> str:
     """List channels and when they were declared, s."""
-    return first_of([f"{name} at {at:.1f} s" for name, at in declared.items()], 3)
+    each = [f"{name} at {at:.1f} s" for name, at in declared.items()]
+    return first_of(each, 3)
 
 
 @dataclass(frozen=True)
@@ -332,9 +333,10 @@ def set_up(
     chosen = candidates(reports)
     lacking = needs(reports)
     if not chosen:
+        kinds = [shown(one.topic.type or "unknown") for one in reports]
         topics = [
-            f"{shown(one.topic.name)} ({shown(one.topic.type or 'unknown')}, {one.received} messages)"
-            for one in reports
+            f"{shown(one.topic.name)} ({kind}, {one.received} messages)"
+            for one, kind in zip(reports, kinds, strict=True)
         ]
         words = first_of(topics, 12, "; ") or "none"
         raise BagError(
@@ -437,7 +439,8 @@ def _kept_from(block: Block) -> tuple[float, float] | None:
     kept = float(np.clip(PROOF.share * lasts[-1], PROOF.least, PROOF.most))
     if lasts[-1] - kept < LEAST_LEFT:
         return None
-    return float(np.cumsum(steps)[np.searchsorted(lasts, lasts[-1] - kept)]), kept
+    first = np.searchsorted(lasts, lasts[-1] - kept)
+    return float(np.cumsum(steps)[first]), kept
 
 
 def _proved(
@@ -464,9 +467,8 @@ def _proved(
         source = shown(proof.name)
     elif (kept := _kept_from(block)) is not None:
         since, seconds = kept
-        learned = block[
-            : int(np.searchsorted(block.stamp, block.stamp[0] + round(since * 1e9)))
-        ]
+        kept_from = block.stamp[0] + round(since * 1e9)
+        learned = block[: int(np.searchsorted(block.stamp, kept_from))]
         start = start + since
         apart = True
         source = f"the last {seconds:.0f} s"
@@ -547,7 +549,8 @@ def _with_mounts(
     careful = _if_built(
         {**before.parameters, "noise.scale_std": [UNKNOWN_AXES.mount]}, before
     )
-    who = f"{' and '.join(names[k] for k in lost)} {'is' if len(lost) == 1 else 'are'}"
+    verb = "is" if len(lost) == 1 else "are"
+    who = f"{' and '.join(names[k] for k in lost)} {verb}"
     why = CalibrationError(
         f"the recording does not show how {who} mounted relative to {names[0]}"
     )
