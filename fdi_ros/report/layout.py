@@ -75,7 +75,9 @@ class Unit(NamedTuple):
 
     def words(self, value: float | None, digits: int = 6) -> str:
         """Return a rate, rad/s, in this unit, or a dash."""
-        return "-" if value is None else f"{value * self.factor:.{digits}f} {self.name}"
+        if value is None:
+            return "-"
+        return f"{value * self.factor:.{digits}f} {self.name}"
 
     def named(self, text: str) -> str:
         """Replace rad/s in a text by this unit."""
@@ -176,7 +178,8 @@ def table(
     texts are shortened.
     """
     most = LINE if figures else WORD
-    lines = [tuple(head), *(tuple(shown(cell, most) for cell in row) for row in rows)]
+    body = [tuple(shown(cell, most) for cell in row) for row in rows]
+    lines = [tuple(head), *body]
     width = [max(map(len, column)) for column in zip(*lines, strict=True)]
     longest = [
         max(map(len, column), default=0) for column in zip(*lines[1:], strict=True)
@@ -333,7 +336,8 @@ def html_table(
     """Lay out a table that can be scrolled, sorted and filtered. Paper has the first rows."""
     rows = list(rows)
     cells = "".join(_cell(name, "th scope=col") for name in head)
-    body = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
+    lines = ("".join(map(_cell, row)) for row in rows)
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
     paper = f'<p class="paper">On paper the first {LENGTHS.paper_rows} of {len(rows)} rows.</p>'
     return (
         '<div class="scroll" tabindex="0" role="region" aria-label="table">'

@@ -40,7 +40,8 @@ class Spectrum:
         """Add samples (N, n), rad/s. A new piece begins if a channel disappears or returns."""
         values = np.vstack([self._waiting, values])
         there = np.isfinite(values)
-        cuts = np.flatnonzero((there[1:] != there[:-1]).any(axis=1)) + 1
+        changes = (there[1:] != there[:-1]).any(axis=1)
+        cuts = np.flatnonzero(changes) + 1
         for piece in np.split(values, cuts):
             self.begin_stretch()
             self._waiting = piece

@@ -258,7 +258,8 @@ class MonitorNode(CheckedNode, LifecycleNode):
             with announced():
                 self._receiver.pipeline.reconfigure(config)
         self.config = config
-        self.log.info(f"changed: {', '.join(f'{p.name} = {p.value}' for p in changes)}")
+        changed = [f"{one.name} = {one.value}" for one in changes]
+        self.log.info(f"changed: {', '.join(changed)}")
 
     def _on_reset(
         self, request: Trigger.Request, response: Trigger.Response

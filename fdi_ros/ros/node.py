@@ -550,7 +550,8 @@ def _typed(parameter: Parameter, field: Field) -> Parameter:
         value = float(value)
     elif field.kind in ("numbers", "texts"):
         value = list(value) if is_list else [value]
-        if field.kind == "numbers" and all(type(one) in (int, float) for one in value):
+        all_numbers = all(type(one) in (int, float) for one in value)
+        if field.kind == "numbers" and all_numbers:
             value = [float(one) for one in value]
     try:
         return Parameter(parameter.name, kind, value)

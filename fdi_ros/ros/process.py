@@ -230,4 +230,5 @@ player_node = partial(run, "player_node")
 
 
 if __name__ == "__main__":
-    sys.exit(run(sys.argv[1] if len(sys.argv) > 1 else "fdi_ros", sys.argv[2:]))
+    node = sys.argv[1] if len(sys.argv) > 1 else "fdi_ros"
+    sys.exit(run(node, sys.argv[2:]))

@@ -378,7 +378,8 @@ class LineReport:
 
 def _clock_words(at: float) -> str:
     """Return a time since 1970 as local time, to hundredths of a second."""
-    return f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at * 100) % 100:02d}"
+    seconds = time.strftime("%H:%M:%S", time.localtime(at))
+    return f"{seconds}.{int(at * 100) % 100:02d}"
 
 
 def _format_figures(picture: Picture) -> str:

@@ -100,8 +100,9 @@ def require(who: str, libraries: Sequence[str]) -> None:
         return
     # By their names: fdi_ros itself is in no index, so its extras can be asked for in a clone alone.
     names = [PACKAGES.get(library, library) for library in missing]
-    listed = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-    raise FdiError(f"{who} needs {listed}: {_pip()} {' '.join(names)}")
+    from fdi_ros.system.text import listed
+
+    raise FdiError(f"{who} needs {listed(names)}: {_pip()} {' '.join(names)}")
 
 
 def there(library: str) -> bool:

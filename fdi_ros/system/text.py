@@ -52,7 +52,8 @@ def visible(text: str, kept: str = "\n\t") -> str:
 
 def listed(words: Sequence[str], last: str = "and") -> str:
     """Join words as a sentence lists them: ``a, b and c``."""
-    return f" {last} ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+    before = ", ".join(words[:-1])
+    return f" {last} ".join(filter(None, [before, words[-1]]))
 
 
 _NUMBER = re.compile(r"([A-Za-z]*)_?([0-9]+)")
@@ -160,7 +161,8 @@ def html_table(
 
     def line(cells: Iterable[object], tag: str) -> str:
         texts = [html.escape(shown(cell, LINE)) for cell in cells]
-        return f"<tr>{''.join(f'<{tag}>{text}</{tag}>' for text in texts)}</tr>"
+        cells_there = "".join(f"<{tag}>{text}</{tag}>" for text in texts)
+        return f"<tr>{cells_there}</tr>"
 
     body = "".join(line(row, "td") for row in rows)
     return f"<table><caption>{html.escape(shown(caption, LINE))}</caption>{line(head, 'th')}{body}</table>"
