@@ -139,7 +139,8 @@ def is_new(gyros: Core) -> bool:
     """Whether the fused rate has a new value, or the vehicle rests, where values may repeat."""
     now = gyros.now
     for i in range(gyros.settings.n):
-        if now.fused >> i & 1 and gyros.health.run_stamp[i] == gyros.last.stamp:
+        changed = gyros.health.run_stamp[i] == gyros.last.stamp
+        if now.fused >> i & 1 and changed:
             return True
     return is_at_rest(gyros.settings, now) and not now.all_repeat
 

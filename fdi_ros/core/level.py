@@ -309,7 +309,8 @@ def update_level(core: Core, subsets: NDArray[Any]) -> None:
             common = math.sqrt(
                 max(now.common[0 if a == 0 else 3 if a == 1 else 5], 0.0)
             )
-            last.level[a] += abs(last.rate[a] - now.plain_rate[a]) + abs(now.lagging[a])
+            left_out = abs(last.rate[a] - now.plain_rate[a])
+            last.level[a] += left_out + abs(now.lagging[a])
             last.level[a] += core.settings.reach * common
             # The units measure at different instants, and each may be the right one.
             apart = core.sample.estimate.largest_delay * core.acceleration.value[a]

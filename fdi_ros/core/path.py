@@ -323,7 +323,8 @@ def bring_together(core: Core, sample: Sample) -> tuple[int, int]:
         aligned,
     )
     for i in range(settings.n):
-        if delivered >> i & 1 and abs(aligned[i]) < core.health.limit[i]:
+        in_range = abs(aligned[i]) < core.health.limit[i]
+        if delivered >> i & 1 and in_range:
             plain |= 1 << i
     return plain, fine
 

@@ -156,7 +156,8 @@ def update_stuck(core: Core, subsets: NDArray[Any], mask: int, stamp: int) -> in
         others = mask & ~(1 << i)
         # A channel that comes gives no motion since before. One that misses single
         # samples changes nothing.
-        if core.health.run_stamp[i] == stamp or others & ~core.witnesses[i]:
+        is_new = core.health.run_stamp[i] == stamp
+        if is_new or others & ~core.witnesses[i]:
             core.witnesses[i] = others
             for j in range(n):
                 # Uncorrected values: a change of the estimated errors is not motion.

@@ -64,7 +64,8 @@ def follow_displacement(params: Constants, kf: Estimator, sample: SampleInput) -
 def close_turn(params: Constants, kf: Estimator) -> None:
     """Take the mean rate of the gyros over a block that is complete."""
     for a in range(3):
-        kf.spins[2, a], kf.spins[1, a] = kf.spins[1, a], kf.spins[0, a]
+        kf.spins[2, a] = kf.spins[1, a]
+        kf.spins[1, a] = kf.spins[0, a]
         kf.spins[0, a] = kf.spin_sum[a] / params.length
         kf.spin_sum[a] = 0.0
 
@@ -86,7 +87,8 @@ def add_displacement_of_block(
         kf.spin_change[a] = 0.5 * (after + before)
         kf.unresolved[a] = 0.5 * (after - before)
         for b in range(3):
-            kf.turned[a, b] = spin[a] * spin[b] - (speed if a == b else 0.0)
+            of_axis = speed if a == b else 0.0
+            kf.turned[a, b] = spin[a] * spin[b] - of_axis
     add_displacement(params, kf, kf.turned, kf.spin_change, covariance)
     for i in range(params.sensors.n):
         # Motion faster than blocks reaches the accelerometers in its own way.
@@ -114,7 +116,8 @@ def add_displacement_of_mean(
         change = kf.total.spin[a] - before.spin[a]
         kf.spin_change[a] = change / (size * params.period)
         for b in range(3):
-            kf.turned[a, b] = (kf.total.turned[a, b] - before.turned[a, b]) / size
+            turned = kf.total.turned[a, b] - before.turned[a, b]
+            kf.turned[a, b] = turned / size
     add_displacement(params, kf, kf.turned, kf.spin_change, covariance)
     edges = min(1.0, EDGES * params.length / size)
     for i in range(params.sensors.n):
@@ -141,7 +144,8 @@ def add_displacement(
                 by += axes[i, k] * turned[k, a]
             kf.displacement[i, a] = kf.position_std[i] * by
         for j in range(i + 1):
-            if i == j or (params.units > 1 and params.unit[i] == params.unit[j]):
+            in_one_unit = params.units > 1 and params.unit[i] == params.unit[j]
+            if i == j or in_one_unit:
                 common = 0.0
                 for a in range(3):
                     common += kf.displacement[i, a] * kf.displacement[j, a]

@@ -566,23 +566,27 @@ def close_block(params: Constants, kf: Estimator) -> None:
         if 2.0 * kf.sum_count[i] >= params.length:
             present |= 1 << i
         kf.means[1, i] = kf.means[0, i]
-        kf.means[0, i] = kf.sum_values[i] / max(kf.sum_count[i], 1.0)
+        count = max(kf.sum_count[i], 1.0)
+        kf.means[0, i] = kf.sum_values[i] / count
         kf.middles[1, i] = kf.middles[0, i]
-        kf.middles[0, i] = kf.sum_time[i] / max(kf.sum_count[i], 1.0) - middle
+        kf.middles[0, i] = kf.sum_time[i] / count - middle
         kf.sum_values[i] = kf.sum_count[i] = kf.sum_time[i] = 0.0
     kf.masks[1] = kf.masks[0]
     kf.masks[0] = present
     for a in range(3):
-        kf.rates[2, a], kf.rates[1, a] = kf.rates[1, a], kf.rates[0, a]
-        kf.ends[2, a], kf.ends[1, a], kf.ends[0, a] = (
-            kf.ends[1, a],
-            kf.ends[0, a],
-            kf.total.instant[a],
-        )
+        kf.rates[2, a] = kf.rates[1, a]
+        kf.rates[1, a] = kf.rates[0, a]
+        kf.ends[2, a] = kf.ends[1, a]
+        kf.ends[1, a] = kf.ends[0, a]
+        kf.ends[0, a] = kf.total.instant[a]
         kf.rates[0, a] = kf.sum_rate[a] / params.length
         kf.sum_rate[a] = 0.0
-    kf.times[2], kf.times[1], kf.times[0] = kf.times[1], kf.times[0], kf.begun + middle
-    kf.ended[2], kf.ended[1], kf.ended[0] = kf.ended[1], kf.ended[0], kf.seconds
+    kf.times[2] = kf.times[1]
+    kf.times[1] = kf.times[0]
+    kf.times[0] = kf.begun + middle
+    kf.ended[2] = kf.ended[1]
+    kf.ended[1] = kf.ended[0]
+    kf.ended[0] = kf.seconds
     kf.sum_seconds = 0.0
     kf.filled = 0
     kf.span = kf.seconds - kf.begun

@@ -236,9 +236,8 @@ def change_regime(noise: Noise, n: int, regime: int, at_least: bool) -> None:
         )
         for k in range(SCALES + LAGS):
             before.level[k, i] = noise.now.level[k, i]
-            noise.now.level[k, i] = max(
-                after.level[k, i], noise.now.level[k, i] if at_least else 0.0
-            )
+            least = noise.now.level[k, i] if at_least else 0.0
+            noise.now.level[k, i] = max(after.level[k, i], least)
     noise.regime = regime
     update_longest(noise, n)
 
@@ -302,7 +301,8 @@ def count_wild(noise: Noise, scale: int, n: int, mask: int, t: Array) -> None:
     """
     for i in range(n):
         if mask >> i & 1:
-            if abs(noise.last[scale, i]) > WILD_STD and t[i] * t[i] < THREE_SIGMA:
+            was_wild = abs(noise.last[scale, i]) > WILD_STD
+            if was_wild and t[i] * t[i] < THREE_SIGMA:
                 noise.wild[scale, i] += 1.0
             noise.last[scale, i] = t[i]
         noise.cap[scale, i] = (noise.seen[scale] + WILD_SAMPLES) / (

@@ -103,7 +103,8 @@ def widen_scales(params: Constants, states: ErrorStates) -> None:
     for i in range(params.sensors.n):
         for k in range(SIGNALS):
             place = layout.place[i, k]
-            if place >= 0 and layout.by[k] != ONE and layout.by[k] != TURN:
+            by_motion = layout.by[k] != ONE and layout.by[k] != TURN
+            if place >= 0 and by_motion:
                 states.p[place, place] += layout.prior[place] * layout.prior[place]
 
 
@@ -114,7 +115,8 @@ def inflate_delays(params: Constants, kf: Estimator, units: int) -> None:
     All delays if the reference unit is among them: they are relative to it.
     """
     for u in range(1, params.units):
-        if params.members[u] & ~units == 0 or params.members[0] & ~units == 0:
+        is_one = params.members[u] & ~units == 0
+        if is_one or params.members[0] & ~units == 0:
             place = params.layout.delays[u]
             kf.states.p[place, place] += (
                 params.layout.prior[place] * params.layout.prior[place]

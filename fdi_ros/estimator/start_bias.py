@@ -73,7 +73,8 @@ def forget_healed(params: Constants, kf: Estimator) -> None:
     """Forget what the start has shown once a bias that was far has gone."""
     healed = False
     for i in range(params.sensors.n):
-        healed = healed or abs(kf.states.x[i]) < HEALED_SHARE * abs(kf.far_bias[i])
+        before = abs(kf.far_bias[i])
+        healed = healed or abs(kf.states.x[i]) < HEALED_SHARE * before
     if healed:
         for i in range(params.sensors.n):
             kf.far_bias[i] = kf.bias_error[i] = 0.0

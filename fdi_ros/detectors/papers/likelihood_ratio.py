@@ -161,9 +161,8 @@ def fill_scratch(
     for i in range(n):
         total = 0.0
         for j in range(n):
-            total += params.residual[i, j] * (
-                sample.z[j] / sensors.noise_std[j] if params.fixed else sample.z[j]
-            )
+            z = sample.z[j] / sensors.noise_std[j] if params.fixed else sample.z[j]
+            total += params.residual[i, j] * z
         room.residual[i] = total
     if not params.fixed:
         for i in range(n):
