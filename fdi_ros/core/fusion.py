@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import Symmetric, Vector, compiled
 from fdi_ros.core.algebra import along, dot
-from fdi_ros.core.parity import apply_gain, covariance_of, fill_parity
+from fdi_ros.core.parity import (
+    LEAST_IN_RESIDUAL,
+    apply_gain,
+    covariance_of,
+    fill_parity,
+)
 from fdi_ros.core.records import (
     ACCELERATION_SAMPLES,
     Acceleration,
@@ -37,8 +42,6 @@ it is a jump: three standard deviations of independent noise."""
 # Largest error that is added, rad/s: far beyond any gyro, and squared still without
 # rounding errors in the other axes.
 LARGEST_DIFFERENCE = 1e3
-# Least share of a channel's variance that counts as the variance of its residual.
-CHECKED_SHARE = 1e-3
 
 
 @compiled
@@ -185,7 +188,7 @@ def is_contradicted(
     if now.fused >> i & 1:
         # A channel that nothing checks has no residual but rounding.
         own = now.uncertainty[i]
-        expected = max(own - rate_variance, CHECKED_SHARE * own)
+        expected = max(own - rate_variance, LEAST_IN_RESIDUAL * own)
     else:
         # The uncertainty of an outlier contains its deviation.
         expected = now.variance[i] + rate_variance

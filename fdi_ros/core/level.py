@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.algebra import along, dot_in
-from fdi_ros.core.parity import fill_parity, gained_rate
+from fdi_ros.core.parity import LEAST_IN_RESIDUAL, fill_parity, gained_rate
 from fdi_ros.core.records import Core, Parity, Subset
 from fdi_ros.core.subsets import number_in
 from fdi_ros.model.samples import Array
@@ -111,12 +111,6 @@ def passes_test(
             if not abs(residual[i]) <= subset.limit[i] * math.sqrt(after / before):
                 passes = False
     return passes
-
-
-#: Smallest share of a channel's variance that must remain in its residual, and of
-#: A_ii A_jj in the determinant of a pair. Below it no residual shows the channel, or
-#: the two channels look alike.
-APART = 1e-3
 
 
 @compiled
@@ -217,7 +211,7 @@ def cover_single(core: Core, i: int, base: float) -> None:
     information = core.now.parity.information[i, i]
     u = core.now.rival[i]
     # With less, no residual shows the channel.
-    if information * core.now.own[i] > APART:
+    if information * core.now.own[i] > LEAST_IN_RESIDUAL:
         log_odds = base + 0.5 * u * u / information
         cover_rival(
             core,
@@ -239,7 +233,8 @@ def cover_pair(core: Core, i: int, j: int, base: float) -> None:
     v = core.now.rival[j]
     determinant = a * b - c * c
     # Two channels that look alike are covered by the single faults.
-    if determinant > APART * a * b:
+    # With a smaller determinant the two channels look alike.
+    if determinant > LEAST_IN_RESIDUAL * a * b:
         error = (b * u - c * v) / determinant, (a * v - c * u) / determinant
         explained = 0.5 * (error[0] * u + error[1] * v)
         log_odds = base + explained + math.log(prior[i] + prior[j])

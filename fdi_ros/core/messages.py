@@ -34,11 +34,11 @@ ENCAPSULATION = 4  #: Bytes before the first field.
 IMU_DOUBLES, IMU_BEFORE_RATE, IMU_BEFORE_FORCE = 4 + 9 + 3 + 9 + 3 + 9, 4 + 9, 3 + 9
 """Number of doubles of an Imu: all, those before the angular velocity (orientation and
 its covariance), and those from there to the linear acceleration."""
-_NS = 1_000_000_000
+NS = 1_000_000_000  #: One second, ns.
 #: seconds of a stamp are 32 bits with a sign
 _SIGN = 1 << 31
 #: Latest whole second that the header of a message can hold, ns.
-LAST_STAMP = (_SIGN - 1) * _NS
+LAST_STAMP = (_SIGN - 1) * NS
 # Index in the upper triangle of each element of a symmetric (3, 3) matrix, by rows.
 FROM_TRIANGLE = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 _IN_ORDER = np.arange(MAX_CHANNELS)
@@ -147,10 +147,10 @@ def read_rate(
     first = both >> 32 & 0xFFFFFFFF
     second = both & 0xFFFFFFFF
     sec, nanosec = (second, first) if little else (first, second)
-    if sec >= _SIGN or nanosec >= _NS:
+    if sec >= _SIGN or nanosec >= NS:
         return -BAD_STAMP
     read_doubles(data, at, 3, little, rate)
-    return sec * _NS + nanosec
+    return sec * NS + nanosec
 
 
 @compiled
@@ -240,8 +240,8 @@ def fill_imu(out: Bytes, at: int, stamp: int, rate: Array, covariance: Array) ->
     covariance
         Upper triangle of the covariance, (rad/s)^2, (6,).
     """
-    seconds = stamp // _NS
-    rest = stamp % _NS
+    seconds = stamp // NS
+    rest = stamp % NS
     for k in range(4):
         out[ENCAPSULATION + k] = seconds >> 8 * k & 255
         out[ENCAPSULATION + 4 + k] = rest >> 8 * k & 255
@@ -297,8 +297,8 @@ def fill_integrity(out: Bytes, at: int, row: OutputRow, n: int, shift: int) -> N
     """
     end = fill_half(out, at, row, n, 1.0)
     stamp = row.stamp - shift
-    _write_double(out, end, stamp // _NS)
-    _write_double(out, end + 8, stamp % _NS)
+    _write_double(out, end, stamp // NS)
+    _write_double(out, end + 8, stamp % NS)
 
 
 @compiled

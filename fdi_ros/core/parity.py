@@ -22,6 +22,9 @@ from fdi_ros.model.samples import MAX_RATE, Array
 
 #: k of an unknown rate. It is not zero, so that an unmeasured axis has an inverse.
 UNKNOWN_RATE = 1.0 / MAX_RATE**2
+#: Smallest share of a channel's variance that must remain in its residual. Below it no
+#: residual shows the channel, and no method judges it.
+LEAST_IN_RESIDUAL = 1e-3
 
 
 @compiled

@@ -9,7 +9,12 @@ import math
 
 from fdi_ros.compiling.compiled import compiled
 from fdi_ros.core.algebra import along, dot_in, square, variance_along
-from fdi_ros.core.parity import UNKNOWN_RATE, fill_joint_parity, fill_parity
+from fdi_ros.core.parity import (
+    LEAST_IN_RESIDUAL,
+    UNKNOWN_RATE,
+    fill_joint_parity,
+    fill_parity,
+)
 from fdi_ros.core.subsets import number_in
 from fdi_ros.estimator.displacement import add_displacement_of_block
 from fdi_ros.estimator.error_states import (
@@ -42,9 +47,6 @@ from fdi_ros.model.samples import Array
 TURNING_RATIO = 20.0
 """Ratio of the squared angular acceleration to its noise variance from which the body
 turns. If noise passed for motion, delays of zero would be learned."""
-# Smallest share of a channel's error in its residual. Below it no method judges the
-# channel.
-LEAST_REDUNDANCY = 1e-3
 FAST_GAIN = 1.0 - math.exp(-2.0 * math.pi * SLOW_MOTION * BLOCK_TIME)
 """Gain of one stage of the high pass, per block."""
 PEAK = 0.8  # factor per block on the peaks of motion: they fade within half a second
@@ -514,7 +516,7 @@ def update_excess(params: Constants, kf: Estimator) -> None:
     fill_parity(kf.expected_parity, params.sensors, kf.mask, params.expected)
     kf.excess = 1.0
     for i in range(n):
-        if information[i, i] * params.expected[i] < LEAST_REDUNDANCY:
+        if information[i, i] * params.expected[i] < LEAST_IN_RESIDUAL:
             continue
         variance = 0.0
         for j in range(n):

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.core.messages import NS
 from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.monitor.diagnostics import input_warning
@@ -35,9 +36,6 @@ from fdi_ros.monitor.soundness import (
 if TYPE_CHECKING:
     from fdi_ros.monitor.diagnostics import InputStatus
     from fdi_ros.monitor.status import ChannelStatus, Status
-
-SECOND = 1_000_000_000
-"""One second, ns."""
 
 
 class _Readings(NamedTuple):
@@ -144,7 +142,7 @@ class RecentHealth:
                 spikes=int(spikes[i]),
                 saturated_s=float(at_end[i]) / status.config.sample_rate,
                 noisy_s=one.last_noisy.seconds if noisy else 0.0,
-                noisy_from_s=(one.last_noisy.since - status.stamp) / SECOND,
+                noisy_from_s=(one.last_noisy.since - status.stamp) / NS,
                 noisy_times=one.last_noisy.times,
                 # A short time of noise would count as the noise of the whole minute.
                 own_noise_rad_s=None if noisy else noise[i],
@@ -156,7 +154,7 @@ class RecentHealth:
 
     def _was_noisy(self, status: Status, channel: ChannelStatus) -> bool:
         """Whether the last spell of noise reaches into the time of the readings."""
-        return status.stamp - channel.last_noisy.until < _PAST.readings * SECOND
+        return status.stamp - channel.last_noisy.until < _PAST.readings * NS
 
     def _rate_health(self) -> RateHealth:
         """Return how long the fused rate was missing, to a second."""

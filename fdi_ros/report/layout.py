@@ -572,8 +572,6 @@ BYTES = 600_000
 """Largest size of the series of a page as text, bytes."""
 FINE, SMALL = "f4", "f2"
 """Kinds of a series: 24 bits for values that are compared, 11 bits (0.05 %) for others."""
-#: largest finite number of 16 bits
-LARGEST_HALF = 65504.0
 
 
 class PageStore:
@@ -665,7 +663,8 @@ class PageStore:
 
 def _packed(values: Array, kind: str) -> str:
     if kind == SMALL:
-        values = np.clip(values, -LARGEST_HALF, LARGEST_HALF)
+        largest = float(np.finfo(np.float16).max)
+        values = np.clip(values, -largest, largest)
     return base64.b64encode(
         np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()
     ).decode("ascii")
