@@ -262,7 +262,8 @@ def find_columns(
     file.seek(0)
     for _ in range(64):
         line = file.readline(TABLE.line_bytes).decode("utf-8", "replace")
-        if sum(map(line.count, ",;\t")) >= 3 and len(line) < TABLE.line_bytes:
+        separators = sum(map(line.count, ",;\t"))
+        if separators >= 3 and len(line) < TABLE.line_bytes:
             break
     else:
         raise BagError(
@@ -282,7 +283,8 @@ def find_columns(
             f"{file.name} has a column name of {longest} characters, expected at most"
             f" {RECORDING.name_length}"
         )
-    if np.isfinite([_number(names, k) for k in range(len(names))]).all():
+    numbers = [_number(names, k) for k in range(len(names))]
+    if np.isfinite(numbers).all():
         raise BagError(
             f"{file.name} has no names of columns: its first line holds numbers. Put a line of names before"
             f" it, such as time,gyro1_x,gyro1_y,gyro1_z,gyro2_x,...: {GUIDE}"
@@ -363,8 +365,8 @@ def _chosen_names(file: BinaryIO, names: Sequence[str], note: Note) -> _Choice:
     time: Any = given.get("time", next(by_name, None))
     listed = shown(", ".join(names), MOST_SHOWN)
     count = Counter(names)
-    triads = (*imus, *forces)
-    for name in (time, *itertools.chain.from_iterable(triads)):
+    both = (*imus, *forces)
+    for name in (time, *itertools.chain.from_iterable(both)):
         if name not in names:
             missing = "no column of times" if name is None else f"no column {name!r}"
             raise BagError(

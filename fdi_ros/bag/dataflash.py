@@ -283,7 +283,8 @@ class DataflashLog(FlightLog):
 
         Returns its samples, the end of its last record, and the bytes that belong to no record.
         """
-        found = np.empty((2, len(data) // _RECORD_HEAD + 1), dtype=np.int64)
+        most = len(data) // _RECORD_HEAD + 1
+        found = np.empty((2, most), dtype=np.int64)
         count, end, lost = find_records(data, self._sizes, final, found)
         number, offset = found[:, :count]
         for start in offset[number == _FMT].tolist():
@@ -464,10 +465,9 @@ def _layout(
     }
     fields: dict[str, tuple[str, int]] = {}
     at = _RECORD_HEAD
+    wanted = (*needed, *acceleration, *_OPTIONAL)
     for column, kind in zip(columns, types, strict=True):
-        if column in (*needed, *acceleration, *_OPTIONAL) and kind in _TYPES_OF.get(
-            column, _NUMBERS
-        ):
+        if column in wanted and kind in _TYPES_OF.get(column, _NUMBERS):
             fields.setdefault(column, (_FIELD_TYPES[kind], at))
         at += np.dtype(_FIELD_TYPES[kind]).itemsize
     if at != size:

@@ -85,7 +85,8 @@ class Thinned:
         good = np.isfinite(value) & (value >= low) & (value <= high)
         stamp = stamp[good].astype(np.int64)
         value = value[good]
-        for k in np.flatnonzero(np.diff(stamp // self._interval, prepend=-1)).tolist():
+        interval = stamp // self._interval
+        for k in np.flatnonzero(np.diff(interval, prepend=-1)).tolist():
             at = int(stamp[k])
             if self._stamps and 0 <= at - self._stamps[-1] < self._interval:
                 continue

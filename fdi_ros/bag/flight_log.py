@@ -229,7 +229,8 @@ class Track:
             return "once"
         if self.last <= self.first:
             return "at times that do not advance"
-        return f"at {figures(self.rate)} Hz{' in bursts' if self.fast_enough and not self.steady else ''}"
+        in_bursts = self.fast_enough and not self.steady
+        return f"at {figures(self.rate)} Hz{' in bursts' if in_bursts else ''}"
 
 
 class FlightLog(BagFile):

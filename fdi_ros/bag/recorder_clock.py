@@ -61,5 +61,6 @@ class RecorderClock:
             added += self._shift.get(number, of_others)
             followed[rows] += added
             self._shift[number] = int(added[-1])
-            self.set_back = max(self.set_back, -int(steps[is_set].min(initial=0)))
+            largest = -int(steps[is_set].min(initial=0))
+            self.set_back = max(self.set_back, largest)
         return followed

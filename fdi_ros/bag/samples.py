@@ -356,7 +356,8 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
     if len(steps) < _FEWEST_STEPS or steps[0] <= 0:
         return
     usual = 1.0 / np.median(steps)
-    mean = 1.0 / steps[: -max(1, len(steps) // 100)].mean()
+    without_longest = steps[: -max(1, len(steps) // 100)]
+    mean = 1.0 / without_longest.mean()
     off = np.array([usual, mean]) / configured
     if (off > 1.0 + WRONG_RATE).all() or (off < 1.0 - WRONG_RATE).all():
         raise BagError(

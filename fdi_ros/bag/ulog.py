@@ -166,7 +166,8 @@ class Ulog(LibraryLog):
             )
             is not None
         }
-        lacking = {source.kind for source in parts.keys() - found.keys()} - {_STATUS}
+        unread = parts.keys() - found.keys()
+        lacking = {source.kind for source in unread} - {_STATUS}
         announced = (
             log.message_formats.keys() - self.counts.keys()
             if log.file_corruption

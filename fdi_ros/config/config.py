@@ -598,7 +598,9 @@ def _value(value: Any) -> Iterator[str]:
         return
     for k in range(0, len(value), 3):
         row = _flow(value[k : k + 3])[1:-1]
-        yield f"{' ' if k else '['}{row}{',' if k + 3 < len(value) else ']'}"
+        begin = " " if k else "["
+        end = "," if k + 3 < len(value) else "]"
+        yield f"{begin}{row}{end}"
 
 
 def _flow(value: Any) -> str:

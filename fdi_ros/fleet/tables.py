@@ -354,7 +354,8 @@ class Fleet:
             f"{_count(own['vehicles'], 'vehicle')}; {faults};"
             f" {own['watched'] / 3600:.2f} hours judged without a declared fault."
         )
-        names = [row["path"].rpartition("/")[2] for row in self.judged if row["damage"]]
+        paths = [row["path"] for row in self.judged if row["damage"]]
+        names = [path.rpartition("/")[2] for path in paths]
         damaged = (
             f"{_count(own['damaged'], 'recording')} could not be read whole:"
             f" {shown(first_of(names, most=3), LINE)}."

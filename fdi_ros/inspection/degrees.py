@@ -239,4 +239,5 @@ def _are_mounted_alike(first: TopicReport, second: TopicReport) -> bool:
     whole = [each[:size] for each in means]
     one, other = (each - np.median(each, axis=0) for each in whole)
     power = float((one**2).sum() + (other**2).sum())
-    return float(((one - other) ** 2).sum()) < (1.0 - TURNS.shared) * power
+    apart = float(((one - other) ** 2).sum())
+    return apart < (1.0 - TURNS.shared) * power

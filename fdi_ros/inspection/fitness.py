@@ -148,9 +148,13 @@ def no_common_time(reports: Sequence[TopicReport]) -> str:
     apart = [one for one in spans if one[1] > end or one[2] < origin]
     if not apart:
         return ""
-    words = [
-        f"{shown(name)} from {figures((first - origin) * 1e-9, 6)} to {figures((last - origin) * 1e-9, 6)} s"
+    seconds = [
+        (shown(name), (first - origin) * 1e-9, (last - origin) * 1e-9)
         for name, first, last in (spans[0], *apart)
+    ]
+    words = [
+        f"{name} from {figures(first, 6)} to {figures(last, 6)} s"
+        for name, first, last in seconds
     ]
     return (
         f"no common time, by the stamps of their samples: {', '.join(words)};"

@@ -159,9 +159,8 @@ def turned_units(path: Path, config: Config) -> str:
     for name, rate in zip(names[1:], others, strict=True):
         rotation = find_turn(first, rate)[0]
         # A fault stays, whatever the rotation.
-        explained = np.std(rate @ rotation.T - first) < (1.0 - TURNS.shared) * np.std(
-            rate - first
-        )
+        left = np.std(rate @ rotation.T - first)
+        explained = left < (1.0 - TURNS.shared) * np.std(rate - first)
         if explained and angle_of(rotation) > TURNS.square:
             turned.append(
                 f"{name} is turned by {math.degrees(angle_of(rotation)):.0f} deg against {names[0]}"
@@ -312,7 +311,8 @@ def _noise_setting(chosen: Sequence[TopicReport]) -> tuple[list[float], str]:
     share = min(one.share for one in noise)
     levels = np.concatenate([one.moving for one in noise])
     words = f"in motion ({percent(share)} of the recording), vibration included"
-    if not (share > 0.5 and np.isfinite(levels).all() and (levels > 0).all()):
+    is_known = np.isfinite(levels).all() and (levels > 0).all()
+    if not (share > 0.5 and is_known):
         quiet = np.concatenate([one.quiet for one in noise])
         usable = np.isfinite(quiet) & (quiet > 0)
         if not usable.any():
@@ -333,7 +333,8 @@ def _longer(chosen: Sequence[TopicReport], intervals: float, most: float) -> flo
         for one in chosen
         if one.intervals
     ]
-    needed = max([*(intervals * report.interval for report in chosen), *nearly_all])
+    usual = [intervals * report.interval for report in chosen]
+    needed = max([*usual, *nearly_all])
     return min(_rounded_up(needed), most) if needed > DEFAULT_TIMEOUT else 0.0
 
 

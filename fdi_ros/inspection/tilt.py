@@ -128,7 +128,8 @@ def _swing(rate: Array, force: Array, step: float) -> Swing:
     if size.min() <= SWING_WINDOWS.least_force * np.median(size):
         return Swing(len(rate), 0.0, 0.0, 0.0)
     gravity = force / size[:, np.newaxis]
-    between = 0.25 * np.cross(gravity[1:] + gravity[:-1], rate[1:] + rate[:-1])
+    twice_gravity = gravity[1:] + gravity[:-1]
+    between = 0.25 * np.cross(twice_gravity, rate[1:] + rate[:-1])
     foretold = np.vstack([np.zeros(3), np.cumsum(between * step, axis=0)])
     time = np.linspace(-1.0, 1.0, len(rate))
     slow, _ = np.linalg.qr(np.vander(time, 3))

@@ -147,7 +147,8 @@ class Geometry:
         azimuth = 2 * np.pi * np.arange(n) / n
         c = 1 / np.sqrt(3.0)
         s = np.sqrt(2 / 3)
-        x, y = s * np.cos(azimuth), s * np.sin(azimuth)
+        x = s * np.cos(azimuth)
+        y = s * np.sin(azimuth)
         return cls(np.column_stack([x, y, np.full(n, c)]))
 
     @classmethod
@@ -262,10 +263,9 @@ class Geometry:
         Raise `GeometryError` if they are too few, or in a plane.
         """
         kept = np.flatnonzero(np.asarray(mask, dtype=bool))
-        return Geometry(
-            self.axes[kept],
-            *([names[i] for i in kept] for names in (self.channel_names, self.unit_of)),
-        )
+        names = [self.channel_names[i] for i in kept]
+        units = [self.unit_of[i] for i in kept]
+        return Geometry(self.axes[kept], names, units)
 
 
 def _check_axes(axes: Array) -> None:

@@ -537,7 +537,8 @@ def assumption_words(geometry: Geometry) -> str:
     See docs/integrity.md.
     """
     names = geometry.channel_names
-    sets = ["/".join(names[i] for i in found) for found in coincidences(geometry)]
+    found = coincidences(geometry)
+    sets = ["/".join(names[i] for i in channels) for channels in found]
     shown = ", ".join(sets[:LISTED_SETS]) + (
         f" and {len(sets) - LISTED_SETS} more sets" if len(sets) > LISTED_SETS else ""
     )

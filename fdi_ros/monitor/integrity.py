@@ -145,7 +145,8 @@ class Integrity:
         limit = np.full(len(mask), np.inf)
         axes = self._axes[kept]
         variance = (self._noise if variances is None else variances)[kept]
-        nothing = ProtectionLevel(np.full(3, np.inf), limit, np.zeros((len(mask), 3)))
+        unbounded = np.full(3, np.inf)
+        nothing = ProtectionLevel(unbounded, limit, np.zeros((len(mask), 3)))
         if not spans_space(axes):
             return nothing
         root = 1 / np.sqrt(self._noise[kept])
@@ -164,10 +165,8 @@ class Integrity:
             np.array(list(combinations(range(len(kept)), size)), dtype=np.intp)
             for size in (1, 2)
         ]
-        test_parts = (
-            parts
-            * (test / np.maximum(spread, MIN_SPREAD * np.sqrt(variance)) ** 2)[:, None]
-        )
+        least = np.maximum(spread, MIN_SPREAD * np.sqrt(variance))
+        test_parts = parts * (test / least**2)[:, None]
         alike = [
             _modes(chosen, prior, gain, residual, variance, test_parts)
             for chosen in sets

@@ -414,7 +414,8 @@ class Pipeline:
         halves = self.halves
         paths = self.paths
         size = len(samples)
-        outs = allocate(OutputRow, size), allocate(OutputRow, size * (len(halves) - 1))
+        of_second = size * (len(halves) - 1)
+        outs = allocate(OutputRow, size), allocate(OutputRow, of_second)
         events: list[Event] = []
         first = row = 0
         while row < size:

@@ -117,14 +117,18 @@ class SampleRateCheck:
     def check(self, count: int, stamp: int) -> None:
         """Take the number of samples so far and the stamp of the last one, ns."""
         points = self._points
-        if points and (count <= points[-1][0] or stamp <= points[-1][1]):
-            points.clear()
+        if points:
+            last_count, last_stamp = points[-1]
+            if count <= last_count or stamp <= last_stamp:
+                points.clear()
         points.append((count, stamp))
         rates = [
             1e9 * (now[0] - before[0]) / (now[1] - before[1])
             for before, now in pairwise(points)
         ]
-        if len(rates) < RATE_WINDOWS or max(rates) > (1 + RATE_TOLERANCE) * min(rates):
+        if len(rates) < RATE_WINDOWS:
+            return
+        if max(rates) > (1 + RATE_TOLERANCE) * min(rates):
             return
         rate = sum(rates) / RATE_WINDOWS
         self.words = ""

@@ -512,7 +512,8 @@ def _has_drifted(one: ChannelHealth) -> bool:
 def _drifted(some: Sequence[ChannelHealth]) -> list[Concern]:
     most = max((abs(one.drift) for one in some), default=0.0)
     verb = "has a bias that" if len(some) == 1 else "have biases that"
-    words = f"{verb} moved by {'up to ' if len(some) > 1 else ''}{figures(most, 2)} rad/s since the start at rest"
+    size = f"{'up to ' if len(some) > 1 else ''}{figures(most, 2)} rad/s"
+    words = f"{verb} moved by {size} since the start at rest"
     return _alike(some, Word.LOOK, Trouble.DRIFT, words)
 
 

@@ -248,10 +248,10 @@ def _parsed_errors(saved: Any, detector: Detector) -> dict[str, Array]:
     ):
         raise ValueError
     # Rounding may leave a covariance a little short of one.
-    std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
-    if (np.diag(covariance) < 0).any() or np.linalg.eigvalsh(
-        covariance / np.outer(std, std)
-    ).min() <= -1e-6:
+    variance = np.diag(covariance)
+    std = np.sqrt(np.maximum(variance, 1e-30))
+    correlation = covariance / np.outer(std, std)
+    if (variance < 0).any() or np.linalg.eigvalsh(correlation).min() <= -1e-6:
         raise ValueError
     return {"value": value, "covariance": covariance, "late": late}
 
@@ -272,7 +272,8 @@ def _check(
     delays = layout["delays"][1 : len(geometry.units)]
     # A state from before the first sample has only biases.
     limit[delays[delays < count]] = LONGEST_DELAY
-    worst = int(np.argmax(np.abs(value) / np.maximum(limit, 1e-300)))
+    relative = np.abs(value) / np.maximum(limit, 1e-300)
+    worst = int(np.argmax(relative))
     if abs(value[worst]) > limit[worst]:
         raise RefusalError(
             f"error state {worst + 1} is {value[worst]:.3g}, expected within {limit[worst]:.3g}"

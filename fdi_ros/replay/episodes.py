@@ -401,7 +401,8 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
         return f"noise of {figure}"
     if size.course == "varying":
         return f"varying, {figure} rms"
-    figure = f"{'-' if value < 0 else '+'}{figure}" if abs(value) > std else TOO_SMALL
+    sign = "-" if value < 0 else "+"
+    figure = f"{sign}{figure}" if abs(value) > std else TOO_SMALL
     if size.course == "gone":
         return f"{figure}, until {size.gone_s:.3f} s"
     if size.course == "steady" or is_too_small(size):

@@ -152,7 +152,8 @@ class Deliveries:
         length = int((self._last - self._first) * 1e-9 / self._width)
         counts = self._counts[:, :length].astype(np.float64)
         # Mean number of messages of each topic, in windows with messages.
-        usual_count = counts.sum(axis=1) / np.maximum((counts > 0).sum(axis=1), 1)
+        with_messages = (counts > 0).sum(axis=1)
+        usual_count = counts.sum(axis=1) / np.maximum(with_messages, 1)
         fewest = usual_count[usual_count > 0].min(initial=WINDOWS.messages)
         together = 1
         while (
@@ -165,7 +166,8 @@ class Deliveries:
         counts = counts.reshape(len(counts), -1, together).sum(axis=2)
         if counts.shape[1] < 2 * WINDOWS.least_slow:
             return [Delivery(1.0, None) for _ in counts]
-        steady: Array = np.array(list(map(self._steady_rate, range(len(counts)))))
+        steady_rates = [self._steady_rate(k) for k in range(len(counts))]
+        steady: Array = np.array(steady_rates)
         most = np.quantile(counts, USUAL_QUANTILE, axis=1)
         usual: Array = np.maximum(np.maximum(most, width * steady), 1.0)
         shares = counts / usual[:, None]
@@ -175,7 +177,8 @@ class Deliveries:
         times: Array = np.asarray(self._start + width * np.flatnonzero(recorded > 0))
         # The quantile is a little more than the mean of the windows of a usual rate.
         full = counts >= WINDOWS.usual * usual[:, None]
-        rates = (counts * full).sum(axis=1) / np.maximum(full.sum(axis=1), 1) / width
+        windows = np.maximum(full.sum(axis=1), 1)
+        rates = (counts * full).sum(axis=1) / windows / width
         rates = np.maximum(rates, steady)
         return [
             _delivery(np.asarray(np.minimum(own, 1.0)), times, width, rate)

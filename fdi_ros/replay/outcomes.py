@@ -376,7 +376,8 @@ class Evaluation:
             int(output.alarm.sum()),
         )
         self._count_missing_rates(output)
-        fine = (output.state == ChannelState.OK) & (np.abs(output.residual) < SQUARED)
+        is_small = np.abs(output.residual) < SQUARED
+        fine = (output.state == ChannelState.OK) & is_small
         self._residuals += (
             (np.where(fine, output.residual, 0.0) ** 2).sum(axis=0),
             fine.sum(axis=0),
@@ -410,7 +411,8 @@ class Evaluation:
             self._has_had_rate = True
             rows = rows[rows > int(output.valid.argmax())]
         if len(rows) and self.without_rate_from is None:
-            self.without_rate_from = round(self.time(int(output.stamp[rows[0]])), 9)
+            first = int(output.stamp[rows[0]])
+            self.without_rate_from = round(self.time(first), 9)
         self.without_rate += len(rows)
 
     def add_unmonitored(self, faulty: Block, healthy: Block) -> None:

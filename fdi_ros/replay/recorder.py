@@ -306,7 +306,8 @@ class Recorder:
             hiding = {i for i in one.members if now[i] in _HIDING}
             members = named or hiding | ambiguous
             if named:
-                one.kind, one.reason = S.FAULTY, reason_of(named) or one.reason
+                one.kind = S.FAULTY
+                one.reason = reason_of(named) or one.reason
             if named or (members and members != one.members):
                 self._step(one, members, at)
         taken = set().union(
@@ -459,7 +460,8 @@ class Recorder:
                 add((i,), gain, residual[:, used] @ gain[used])
         for a, b in self._pairs if one.kind == S.AMBIGUOUS else ():
             if {a, b} <= one.members:
-                both = np.isin(np.arange(len(axes)), (a, b)).astype(np.float64)
+                channels = np.arange(len(axes))
+                both = np.isin(channels, (a, b)).astype(np.float64)
                 scale = float(axes[a] @ axes[b]) / float(axes[b] @ axes[b])
                 difference = residual[:, a] - scale * residual[:, b]
                 add((a, b), both, difference)

@@ -140,10 +140,11 @@ def parse_swept(text: str) -> tuple[Swept, ...]:
             f"fault {kind} strikes a whole unit; a sweep strikes one channel at a time"
         )
     sizes = items.pop("size", "").split(",")
-    found = tuple(
-        Swept(kind, (*([("size", size)] if size else []), *items.items()), channels)
+    options = {
+        size: {"size": size, **items} if size else items
         for size in dict.fromkeys(sizes)
-    )
+    }
+    found = tuple(Swept(kind, tuple(own.items()), channels) for own in options.values())
     for one in found:
         fault_from({"channel": "any", "kind": kind, **dict(one.items)})
         if (
@@ -563,7 +564,8 @@ def _times(baselines: Sequence[Baseline], block: Block, plan: Plan) -> list[floa
     ends = np.cumsum(high - low)
     after = ends[-1] * (np.arange(plan.times) + 0.5) / plan.times
     place = np.searchsorted(ends, after)
-    return np.asarray(low[place] + (after - (ends - (high - low))[place])).tolist()
+    before = ends - (high - low)
+    return np.asarray(low[place] + (after - before[place])).tolist()
 
 
 def _take_times(

@@ -127,7 +127,8 @@ def _quantiles(delays: Sequence[float], trials: int, within: float) -> Delays:
 
 def smallest(lines: Sequence[Line], named: bool) -> dict[str, float | None]:
     """Return for each kind the smallest size from which on all sizes are found, or isolated."""
-    found = {family: _smallest(own, named) for family, own in _families(lines).items()}
+    families = _families(lines)
+    found = {family: _smallest(own, named) for family, own in families.items()}
     return {
         family: None if line is None else line.swept.size
         for family, line in found.items()

@@ -269,7 +269,8 @@ def _advice(judgement: Judgement, faulty: Sequence[Episode]) -> str:
     named: dict[str, None] = {}
     doubted: list[list[str]] = []
     for one in faulty:
-        units = list(dict.fromkeys(unit_of.get(name, name) for name in one.channels))
+        owners = [unit_of.get(name, name) for name in one.channels]
+        units = list(dict.fromkeys(owners))
         if one.state == "AMBIGUOUS" and len(units) > 1:
             doubted.append(units)
         else:
@@ -360,7 +361,9 @@ def _who(one: Episode) -> str:
         return parts[0][0]
     if one.state == "AMBIGUOUS":
         return _one_of(one) if len(parts) > 1 else f"{one.who} (not confirmed)"
-    if one.state != "FAULTY" or len(parts) == 1 or len(units) > 1 or "" in units:
+    is_alone = len(parts) == 1
+    in_one_unit = len(units) == 1 and "" not in units
+    if one.state != "FAULTY" or is_alone or not in_one_unit:
         return one.who.removesuffix(",")
     unit = parts[0][0]
     if one.who == unit:

@@ -288,7 +288,8 @@ class Pair(NamedTuple):
     @property
     def rows(self) -> list[tuple[Mapping[str, Any] | None, ...]]:
         """Plots in rows of two. None: one replay has fewer plots."""
-        return list(zip_longest(*([*one.figures] if one else [] for one in self)))
+        columns = [[*one.figures] if one else [] for one in self]
+        return list(zip_longest(*columns))
 
     @property
     def _shown(self) -> Section:
@@ -592,7 +593,8 @@ class PageStore:
         self.kinds = dict(kinds)
         size = 8 + sum(int(kind[1]) for kind in kinds.values())
         # base64 has 4 characters for 3 bytes.
-        self._most = most or max(200, int(BYTES / (4 / 3) / size))
+        fitting = int(BYTES / (4 / 3) / size)
+        self._most = most or max(200, fitting)
         self.width = 1
         """Number of samples in a new span."""
         self._time = np.empty(0)

@@ -134,7 +134,8 @@ class ChangeLog:
                 continue
             words = format_reason(event, self._names)
             words += f"; {pair}" if pair is not None and len(event.group) > 1 else ""
-            line = f"{event.before.name} -> {event.after.name} at {(event.stamp - shift) / 1e9:.3f} s"
+            at = (event.stamp - shift) / 1e9
+            line = f"{event.before.name} -> {event.after.name} at {at:.3f} s"
             lines.setdefault(
                 (event.after, f"{line}{words and ': '}{words}"), []
             ).append(event.channel)

@@ -89,7 +89,8 @@ class Prepared:
         """Return the forces (N, width) as a monitor has them with delays taken off, m/s^2."""
         delay = self.priors.delay[self.priors.unit]
         z = np.full((len(stamp), width), np.nan)
-        z[:, self.active] = resampled(self.data, delay)[0] * FORCE.natural
+        shifted, _ = resampled(self.data, delay)
+        z[:, self.active] = shifted * FORCE.natural
         return Block(stamp, z, np.isfinite(z))
 
 
@@ -127,7 +128,8 @@ def prepare_accelerometers(
     data.z = (data.z - _added(data, gyros, axes, arms, delay)) / FORCE.natural
     spiky = spikes(data.z, axes)
     data.z[spiky] = np.nan
-    known = [config.has_units and name.rpartition(".")[0] in trusted for name in names]
+    owners = [name.rpartition(".")[0] for name in names]
+    known = [config.has_units and unit in trusted for unit in owners]
     priors = Priors(
         axes=axes,
         unit=of,

@@ -264,9 +264,8 @@ def _contradictions(square: Array, axes: Array, i: int) -> list[tuple[float, flo
     """
     size = float(np.sqrt(square[i, i]))
     found = []
-    for three in map(
-        list, itertools.combinations([j for j in range(len(axes)) if j != i], 3)
-    ):
+    others = [j for j in range(len(axes)) if j != i]
+    for three in map(list, itertools.combinations(others, 3)):
         if not spans_space(axes[three]):
             continue
         gain = np.linalg.solve(axes[three].T, axes[i])
@@ -350,9 +349,8 @@ def _against(first: Array, unit: Array) -> Mount:
         return Mount(
             f"NOT KNOWN: all units give values together for only {len(unit) * TURNS.window:.0f} s"
         )
-    most, second = np.sqrt(
-        np.maximum(np.linalg.eigvalsh(unit.T @ unit / len(unit)), 0.0)
-    )[:0:-1]
+    powers = np.linalg.eigvalsh(unit.T @ unit / len(unit))
+    most, second = np.sqrt(np.maximum(powers, 0.0))[:0:-1]
     if most < LEAST_RATE:
         return Mount(f"NOT KNOWN: it does not turn ({figures(most, 2)} rad/s rms)")
     rotation, mirrored, uncertainty = find_turn(first, unit)

@@ -255,7 +255,8 @@ def lagrange_weights(knots: Array, x: Array, usual: float) -> tuple[Int, Array]:
     """
     if len(knots) < POINTS:
         return np.full(len(x), -1), np.zeros((len(x), POINTS))
-    first = np.clip(np.searchsorted(knots, x) - POINTS // 2, 0, len(knots) - POINTS)
+    before = np.searchsorted(knots, x) - POINTS // 2
+    first = np.clip(before, 0, len(knots) - POINTS)
     around = knots[first[:, None] + np.arange(POINTS)]
     # With a sample missing they span one interval more.
     there = (

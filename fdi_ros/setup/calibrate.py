@@ -482,7 +482,8 @@ def _without(faults: Sequence[Span], data: Data, names: tuple[str, ...]) -> Data
         z[struck] = np.nan
     if share.max() > NEEDED_DATA.faulty:
         group = [names[i] for i in np.flatnonzero(share > NEEDED_DATA.faulty)]
-        first = next(span for span in clear if int(share.argmax()) in span.channels)
+        worst = int(share.argmax())
+        first = next(span for span in clear if worst in span.channels)
         raise DisagreementError(
             f"{' or '.join(group)} disagrees with the others in {percent(share.max())} of the recording (from"
             f" {first.start:.1f} s): faulty; repair it, leave this part out with --start and --end, or name it in"

@@ -269,7 +269,8 @@ def _widened(sensors: Priors, axes: Array) -> Priors:
     """Widen the prior of the axes where these are farther off than expected."""
     off = axes - sensors.axes
     apart = off - axes @ (np.linalg.pinv(axes) @ off)
-    size = float(np.sqrt((apart**2).sum() / (3 * (len(axes) - 3))))
+    checks = 3 * (len(axes) - 3)
+    size = float(np.sqrt((apart**2).sum() / checks))
     times = size / max(float(np.median(sensors.scale_std)), 1e-9)
     # With two units chance makes 1.5 once in 60 recordings.
     return replace(
@@ -472,9 +473,8 @@ class _Pass:
         n = len(self.axes)
         coefficients, prior = coefficients_of(sensors, axes)
         moving = (~self.still[self.window])[:, None]
-        base = np.hstack(
-            [np.ones((len(y), 1)), self.rate * moving, acceleration * moving]
-        )
+        one = np.ones((len(y), 1))
+        base = np.hstack([one, self.rate * moving, acceleration * moving])
         base = base * self.used[:, None]
         # In motion A H = 0. Subtracting the rate first avoids the rounding error.
         residual = (y - (self.rate * moving) @ axes.T) * self.used[:, None]

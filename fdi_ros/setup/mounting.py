@@ -71,7 +71,8 @@ def waiting(config: Config, geometry: Geometry, noise: NoiseModel) -> dict[str, 
         if samples < 1.5:
             return np.full(geometry.n, np.nan)
         inverse = np.linalg.inv((V * (white + samples * lasting)) @ V.T)
-        gain = np.sqrt(np.maximum(np.einsum("ai,ab,bi->i", V, inverse, V), 0))
+        square = np.einsum("ai,ab,bi->i", V, inverse, V)
+        gain = np.sqrt(np.maximum(square, 0))
         shift = smallest_shift(samples, 1 / alarm_probability(config))
         with np.errstate(divide="ignore"):
             return np.where(geometry.detectable, shift / gain, np.inf)

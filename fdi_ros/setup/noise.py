@@ -108,8 +108,9 @@ def of_the_moment(covariance: Array, there: Mask, axes: Array) -> Array:
     weight = np.zeros(len(filled))
     for shift in reversed(range(2 * NEIGHBOURS + 1)):
         # The mean of covariances of other channels would be none.
-        same = (there == beside[shift : shift + len(there)]).all(axis=1)
-        total += np.where(same[:, None, None], near[shift : shift + len(there)], 0.0)
+        rows = slice(shift, shift + len(there))
+        same = (there == beside[rows]).all(axis=1)
+        total += np.where(same[:, None, None], near[rows], 0.0)
         weight += same
     found = _by_pattern(
         variances, total / np.maximum(weight, 1)[:, None, None], there, axes
@@ -174,7 +175,8 @@ def levels(covariance: Array, there: Mask, axes: Array) -> Array:
 def _quietest(level: Array, count: Int) -> Mask:
     """Return the windows (W,) about as quiet as the quietest, by levels (W,)."""
     known = int(np.isfinite(level).sum())
-    least = np.argsort(level)[:known][: max(4, round(0.05 * known))]
+    in_order = np.argsort(level)[:known]
+    least = in_order[: max(4, round(0.05 * known))]
     quiet = np.zeros(len(level), dtype=bool)
     quiet[least] = True
     # The quietest of many are quiet by chance, too: the mean of all that are as quiet is not.

@@ -114,7 +114,8 @@ def measure(
     each: Array = np.asarray(covariance).reshape(n, TERMS, n, TERMS)
     # Asymmetry and nonlinearity of odd order.
     squares = [_mean_square(found[:, k], each[:, k, :, k], axes) for k in (5, 6)]
-    value = float(np.sqrt(max(sum(square for square, _ in squares), 0.0)))
+    square_sum = sum(square for square, _ in squares)
+    value = float(np.sqrt(max(square_sum, 0.0)))
     spread = float(np.sqrt(sum(error**2 for _, error in squares)))
     return Nonlinearity(value, spread / (2.0 * max(value, _NONLINEARITY.usual)))
 

@@ -128,7 +128,8 @@ def _forces(block: Block, config: Config, found: StateEstimate) -> Array:
     axes = build_geometry(config).axes.reshape(-1, 3, 3)
     most = np.broadcast_to(config.accelerometers.max_acceleration, block.z.shape[1])
     data = prepare(block, most)
-    mean = make_blocks(data, delays_of(config, found)).mean.reshape(-1, len(axes), 3)
+    blocks = make_blocks(data, delays_of(config, found))
+    mean = blocks.mean.reshape(-1, len(axes), 3)
     return np.asarray(np.einsum("uab,kub->kua", np.linalg.inv(axes), mean)) / (
         FORCE.natural
     )
@@ -159,7 +160,8 @@ def turning_of(found: StateEstimate) -> tuple[Array, Array]:
     acceleration = blocks.slopes(rate)
     # What no rate explains is noise, about alike in all channels.
     apart = projector(found.axes)
-    size = np.nan_to_num((np.diff(blocks.mean, axis=0) @ apart) ** 2).sum(axis=1) / 2
+    steps = np.diff(blocks.mean, axis=0) @ apart
+    size = np.nan_to_num(steps**2).sum(axis=1) / 2
     total = np.add.reduceat(np.append(size, 0.0), blocks.start) / blocks.size
     of_rate = np.linalg.inv(found.axes.T @ found.axes) / max(len(apart) - 3, 1)
     noise = total[:, None, None] * of_rate / (2.0 * blocks.length**2)

@@ -435,7 +435,8 @@ def _kept_from(block: Block) -> tuple[float, float] | None:
     if len(block) < 2:
         return None
     steps = np.diff(block.stamp) * 1e-9
-    lasts = np.cumsum(np.minimum(steps, INTERVALS.gap * np.median(steps)))
+    longest = INTERVALS.gap * np.median(steps)
+    lasts = np.cumsum(np.minimum(steps, longest))
     kept = float(np.clip(PROOF.share * lasts[-1], PROOF.least, PROOF.most))
     if lasts[-1] - kept < LEAST_LEFT:
         return None
@@ -540,9 +541,8 @@ def _with_mounts(
         for k, mount in enumerate(mounts)
         if mount.rotation is None and not mount.contradicts
     ]
-    found = _calibrated(
-        block, before, reference, [3 * k + axis for k in lost for axis in range(3)]
-    )
+    channels = [3 * k + axis for k in lost for axis in range(3)]
+    found = _calibrated(block, before, reference, channels)
     if not lost or found.calibration is not None:
         return found
     # Nothing may be declared because of mounts that nobody knows.

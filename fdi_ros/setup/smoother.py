@@ -136,7 +136,8 @@ def _eliminate(of: NormalEquations, walk: float) -> tuple[Array, Array, Array, f
     )
     information = 0.5 * (information + information.T)
     side = of.start[n:] + of.right[:, n:].sum(axis=0) - border.T @ alone
-    fits = float(h.ravel() @ alone + side @ np.linalg.solve(information, side))
+    constants = np.linalg.solve(information, side)
+    fits = float(h.ravel() @ alone + side @ constants)
     volume = (
         2.0 * np.log(factor[0]).sum()
         - n * np.log(stiffness).sum()
@@ -149,7 +150,8 @@ def find_random_walk(of: NormalEquations) -> RandomWalk:
     """Find the walk of the biases by its marginal likelihood."""
     if len(of.normal) < 3:
         return RandomWalk(0.0, float(WALKS[-1]))
-    none, *logs = (_eliminate(of, walk)[-1] for walk in (0.0, *WALKS))
+    tried = (0.0, *WALKS)
+    none, *logs = (_eliminate(of, walk)[-1] for walk in tried)
     best = int(np.argmax(logs))
     # Between the walks tried, by a parabola.
     shift = 0.0
@@ -171,7 +173,8 @@ def smooth(
     ``known``: the first constants (k,) and their covariance (k, k) from elsewhere. They
     stay as given, and their uncertainty counts (Schmidt 1966).
     """
-    n, (solved, information, side, _) = of.n, _eliminate(of, walk)
+    n = of.n
+    solved, information, side, _ = _eliminate(of, walk)
     if known is None:
         covariance = np.linalg.inv(information)
         constant = covariance @ side

@@ -121,6 +121,7 @@ def _pip() -> str:
     if not own and managed.is_file():
         return "pip install --user --break-system-packages"
     found = shutil.which("pip")
-    if own and (found is None or Path(found).parent != Path(sys.executable).parent):
+    is_own = found is not None and Path(found).parent == Path(sys.executable).parent
+    if own and not is_own:
         return f"{sys.executable} -m pip install"
     return "pip install"

@@ -150,7 +150,8 @@ def plus_minus(value: float, std: float) -> str:
     if not math.isfinite(std) or std <= 0.0:
         return figures(value)
     exponent = math.floor(math.log10(std))
-    places = max(0, min(9, (1 if std < 2 * 10**exponent else 0) - exponent))
+    further = 1 if std < 2 * 10**exponent else 0
+    places = max(0, min(9, further - exponent))
     return f"{value:.{places}f} +- {std:.{places}f}"
 
 
