@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import functools
 import math
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -38,8 +39,29 @@ from fdi_ros.core.parity import apply_gain, eliminate_rate
 from fdi_ros.core.records import BIAS_PORTIONS, Bias, Core, Portion, Subset, ValueGroup
 from fdi_ros.model.samples import MAX_RATE, Array
 
-FIXED, LEARNING, LEARNED, RESTORED, TOO_FEW, NOT_AT_REST, IN_MOTION = range(7)
-"""Origin of the bias, or reason why the last average was refused."""
+
+class BiasOrigin(IntEnum):
+    """Origin of the bias, or reason why the last average was refused."""
+
+    #: as the settings give it, or zero
+    FIXED = 0
+    #: an average at rest is under way
+    LEARNING = 1
+    #: averaged at rest
+    LEARNED = 2
+    #: read from the state file
+    RESTORED = 3
+    #: refused: too few channels or samples
+    TOO_FEW = 4
+    #: refused: the vehicle moved
+    NOT_AT_REST = 5
+    #: the vehicle starts in motion: biases as given
+    IN_MOTION = 6
+
+
+FIXED, LEARNING, LEARNED, RESTORED, TOO_FEW, NOT_AT_REST, IN_MOTION = map(
+    int, BiasOrigin
+)
 #: Smallest number of samples of an average. Fewer may be a single group without scatter.
 LEAST_ROWS = 10
 #: A channel must give a value in one of this many samples: units may have lower rates.

@@ -11,6 +11,7 @@ complete sample.
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from typing import Any
 
 from numpy.typing import NDArray
@@ -28,11 +29,26 @@ from fdi_ros.core.path import Path, step_halves, wants_supply
 from fdi_ros.core.records import Aligner, Inlet, Live
 from fdi_ros.model.samples import Bytes
 
-WORKED, HAS_RATE, HAS_EVENTS, MORE, SUPPLY, MALFORMED = 1, 2, 4, 8, 16, 32
-"""Bits of the results of `receive` and `process`: a sample was processed; the sample
-has a fused rate; the sample has events; another sample is ready; something must be
-prepared before the next call (which continues with the same sample if none was
-processed); the message was refused."""
+
+class LiveResult(IntEnum):
+    """Bits of the results of `receive` and `process`."""
+
+    #: a sample was processed
+    WORKED = 1
+    #: the sample has a fused rate
+    HAS_RATE = 2
+    #: the sample has events
+    HAS_EVENTS = 4
+    #: another sample is ready
+    MORE = 8
+    #: Something must be prepared before the next call, which continues with the same
+    #: sample if none was processed.
+    SUPPLY = 16
+    #: the message was refused
+    MALFORMED = 32
+
+
+WORKED, HAS_RATE, HAS_EVENTS, MORE, SUPPLY, MALFORMED = map(int, LiveResult)
 NO_STAMP = -1  #: In place of a stamp.
 #: Largest time of a live stamp ahead of the clock, ns: clocks of computers differ.
 AHEAD_OF_CLOCK = 1_000_000_000
