@@ -15,6 +15,7 @@ from pathlib import Path
 
 from fdi_ros.mavlink.failover_evidence import SILENCE, Evidence
 from fdi_ros.mavlink.failover_file import FailoverFile, Saved
+from fdi_ros.mavlink.failover_lane import LaneReport, LaneState, follow
 from fdi_ros.mavlink.failover_policy import (
     Imu,
     PolicySettings,
@@ -27,7 +28,9 @@ from fdi_ros.mavlink.failover_probe import Probe, probe
 from fdi_ros.mavlink.failover_raw import CURRENT
 from fdi_ros.mavlink.failover_ready import (
     EKF_LANES,
+    EKF_PRIMARY,
     INS_USE,
+    LARGEST_LOSS,
     Facts,
     doubt,
     not_again,
@@ -122,6 +125,8 @@ class Failover:
         self._words = WordsState((Note(),) * count)
         self._values: list[tuple[bool | None, int]] = [(None, 0)] * count
         self._lanes: int | None = None  # of `EKF_LANES`. None: not reported
+        self._primary: int | None = None  # of `EKF_PRIMARY`. None: not reported
+        self._lane = LaneState()
         self._conversation = 0
         self._boots = 0
         self._booted: int | None = None  # when the autopilot started, ns
@@ -196,9 +201,37 @@ class Failover:
         for imu, use in decision.orders:
             self._vehicle.set_parameter(INS_USE[imu], float(use))
         self._count_losses(now)
+        self._follow_lane(view, now)
         self._announce(view, now)
         if error := self._file.keep(self._saved(now), now):
             self._vehicle.events.append(error)
+
+    def _follow_lane(self, view: View, now: int) -> None:
+        """Ask for another EKF lane where a bad IMU has misled the primary one."""
+        vehicle = self._vehicle
+        silence = now - vehicle.heard
+        count = len(view.imus)
+        mask = self._lanes or 0
+        named = None
+        while vehicle.lanes:
+            named = vehicle.lanes.popleft()
+        report = LaneReport(
+            named=named,
+            configured=self._primary,
+            # Without a lane for one IMU, the next one has its number.
+            lanes=next((k for k in range(count) if not mask >> k & 1), count),
+            is_complete=silence < SILENCE and self._lost <= LARGEST_LOSS,
+            has_texts=vehicle.texts > 0,
+        )
+        memories = self._state.memories
+        self._lane, asks = follow(
+            self._lane, report, memories, view, now, self._settings
+        )
+        if asks:
+            vehicle.ask_for_lane()
+            vehicle.events.append(
+                f"EKF lane {self._lane.primary} was misled: asked for another lane"
+            )
 
     def _try_orders(self, view: View, now: int) -> None:
         """Find out whether the autopilot sets INS_USE, while no order depends on it."""
@@ -311,7 +344,7 @@ class Failover:
 
     def _forget(self) -> None:
         self._values = [(None, 0)] * len(self._values)
-        self._lanes = None
+        self._lanes = self._primary = None
 
     def _read(self, now: int) -> None:
         """Take the reports of parameters, and ask for the next."""
@@ -327,10 +360,8 @@ class Failover:
             # What comes beside old samples is as old, perhaps from before our orders.
             if name in names and not is_late:
                 self._values[names.index(name)] = (value != 0, now)
-            elif name == EKF_LANES and 0 <= value < 256:
-                # A bit that is set later counts only from the next start on.
-                known = 255 if self._lanes is None else self._lanes
-                self._lanes = known & int(value)
+            elif 0 <= value < 256:
+                self._hear_of_lanes(name, int(value))
         usual = READ_EVERY if vehicle.armed else READ_ON_GROUND
         pause = READ_HURRIED if self._hurry else usual
         if vehicle.in_reach and now - self._read_at >= pause:
@@ -340,6 +371,16 @@ class Failover:
                     vehicle.read_parameter(name)
             if self._lanes is None or not vehicle.armed:
                 vehicle.read_parameter(EKF_LANES)
+            if not vehicle.armed:
+                vehicle.read_parameter(EKF_PRIMARY)
+
+    def _hear_of_lanes(self, name: str, value: int) -> None:
+        if name == EKF_LANES:
+            # A bit that is set later counts only from the next start on.
+            known = 255 if self._lanes is None else self._lanes
+            self._lanes = known & value
+        elif name == EKF_PRIMARY:
+            self._primary = value
 
     def _view(self, now: int, restore: bool = False) -> View:
         vehicle = self._vehicle

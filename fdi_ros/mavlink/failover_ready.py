@@ -35,6 +35,7 @@ from fdi_ros.mavlink.protocol import MS
 INS_USE = ("INS_USE", "INS_USE2", "INS_USE3")
 #: Bit mask of the IMUs that have an EKF lane. ArduPilot takes it over at its start.
 EKF_LANES = "EK3_IMU_MASK"
+EKF_PRIMARY = "EK3_PRIMARY"  #: EKF lane that ArduPilot flies with from arming on.
 LARGEST_AGE = 1.0  #: Age of the newest judged sample from which the monitor is late, s.
 LARGEST_LOSS = 0.1  #: Largest share of lost messages.
 LARGEST_READY_TRIP = 300 * MS  #: Longest round trip, ns.

@@ -9,7 +9,7 @@ other addresses than the one in use, wrong signatures, impossible times.
 
 Nothing that is sent commands the vehicle: HEARTBEAT, TIMESYNC,
 MAV_CMD_SET_MESSAGE_INTERVAL, STATUSTEXT, NAMED_VALUE_FLOAT. `fdi_ros.mavlink.failover`
-adds PARAM_REQUEST_READ and PARAM_SET.
+adds PARAM_REQUEST_READ, PARAM_SET and MAV_CMD_DO_AUX_FUNCTION.
 """
 
 from __future__ import annotations
@@ -58,6 +58,10 @@ _PEERS = 8  # largest number of addresses with a parser
 _LEFT = 1 << 12
 #: ArduPilot's text where it refuses to set a parameter.
 DENIED = re.compile(r"Param write denied \((\w+)\)")
+#: ArduPilot's texts where its primary EKF lane has changed, of the EKF and of the vehicle.
+LANE_CHANGED = re.compile(r"EKF3 lane switch (\d+)|EKF primary changed:(\d+)")
+LANE_SWITCH = 103  #: RC option and auxiliary function "EKF lane switch" of ArduPilot.
+SWITCH_HIGH = 2  #: Position of the switch of an auxiliary function.
 TWO_SENDERS = (
     "two senders as system {} behind one address: two autopilots with one id, or two"
     " links of one"
@@ -225,6 +229,9 @@ class Vehicle:
         self.parameters: deque[tuple[str, float]] = deque(maxlen=64)
         #: Parameters that the autopilot has refused to set.
         self.denied: deque[str] = deque(maxlen=64)
+        self.texts = 0  #: Number of texts received.
+        #: EKF lanes that became primary, from texts. The reader takes them out.
+        self.lanes: deque[int] = deque(maxlen=64)
         self._found = self._first_imu = 0
         # Kinds and units that sent samples, until a kind is chosen.
         self._seen: set[tuple[str, int]] = set()
@@ -302,15 +309,21 @@ class Vehicle:
         elif number == mavlink.MAVLINK_MSG_ID_PARAM_VALUE and is_new:
             name = message.param_id.partition("\0")[0]
             self.parameters.append((name, message.param_value))
-        elif number == mavlink.MAVLINK_MSG_ID_STATUSTEXT and (
-            found := DENIED.match(message.text)
-        ):
-            self.denied.append(found[1])
+        elif number == mavlink.MAVLINK_MSG_ID_STATUSTEXT:
+            self._hear_text(message.text, is_new)
         elif (
             number == mavlink.MAVLINK_MSG_ID_COMMAND_ACK
             and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
         ):
             self.streams.acknowledged(message.result)
+
+    def _hear_text(self, text: str, is_new: bool) -> None:
+        """Take a text of the autopilot."""
+        self.texts += 1
+        if found := DENIED.match(text):
+            self.denied.append(found[1])
+        elif is_new and (found := LANE_CHANGED.match(text)):
+            self.lanes.append(int(found[1] or found[2]))
 
     def _parsed(self, peer: Any, data: bytes) -> list[Any]:
         """Return the messages in bytes; each address has a parser of its own."""
@@ -588,6 +601,12 @@ class Vehicle:
             value,
             self._mavlink.MAV_PARAM_TYPE_REAL32,  # ArduPilot accepts any type.
         )
+
+    def ask_for_lane(self) -> None:
+        """Ask ArduPilot to change to the EKF lane with the best score."""
+        command = self._mavlink.MAV_CMD_DO_AUX_FUNCTION
+        fields = (command, 0, LANE_SWITCH, SWITCH_HIGH, 0, 0, 0, 0, 0)
+        self._say("command_long", self.system, self._component, *fields)
 
     def send_value(self, name: str, value: float, now: int) -> None:
         """Send a NAMED_VALUE_FLOAT, its name up to 10 characters, at the monotonic time now, ns."""

@@ -14,7 +14,9 @@ and again with their old value after the text `Param write denied (NAME)`; it fl
 Seen in ArduCopter 4.6.3's own simulation: a read is answered up to 100 ms late, from another thread, with the value of
 when it was read (`late_reads`); EKF lane k follows IMU k, or the first IMU in use while IMU k is out (`lanes`); notch
 filters are allocated at the start, only for IMUs in use then (`notches`), and EKF lanes for the IMUs in EK3_IMU_MASK,
-of which the start removes those that do not exist.
+of which the start removes those that do not exist. It flies with the gyro of its primary lane: of EK3_PRIMARY while
+disarmed, in flight often of a lane that a bad IMU has misled (`misled`), until the auxiliary function 103 asks for the
+best one. It changes at most once in 5 s, and says so in two texts (`primary`).
 """
 
 import contextlib
@@ -88,6 +90,10 @@ SCALED_IMU = {
 HEADER = struct.Struct("<BBBBBBBHB")
 PARAMETERS = ("INS_USE", "INS_USE2", "INS_USE3")
 EKF_LANES = "EK3_IMU_MASK"
+EKF_PRIMARY = "EK3_PRIMARY"
+DO_AUX_FUNCTION, LANE_SWITCH = 218, 103
+LANE_PAUSE = 5 * NS  #: Least time between two changes of the primary lane, ns.
+LANE_RECOVERY = 7.0  #: Time constant with which the attitude of a lane recovers, s.
 
 
 def framed(mav: mavlink.MAVLink, number: int, fields: Sequence[int]) -> bytes:
@@ -122,7 +128,11 @@ class Autopilot:
     commands: list[tuple[int, ...]] = field(default_factory=list)
     refuses: set[int] = field(default_factory=set)
     parameters: dict[str, float] = field(
-        default_factory=lambda: {**dict.fromkeys(PARAMETERS, 1.0), EKF_LANES: 7.0}
+        default_factory=lambda: {
+            **dict.fromkeys(PARAMETERS, 1.0),
+            EKF_LANES: 7.0,
+            EKF_PRIMARY: 0.0,
+        }
     )
     read_only: set[str] = field(default_factory=set)
     sets: list[tuple[int, str, float]] = field(
@@ -158,6 +168,11 @@ class Autopilot:
         self._beat = self._asked = 0
         self._moved: tuple[int, np.ndarray] = (-1, np.empty(0))  # rates at a time, ns
         self._answers: list[tuple[int, str, float]] = []  # when, ns; name and value
+        self.primary = 0  # lane, from 0
+        self.misled = np.zeros(self.units)  # error of the attitude of each lane, rad
+        self.lane_asks: list[int] = []  # when the lane switch was asked for, ns
+        self._lane_changed, self._flown_until = -LANE_PAUSE, 0
+        self._was_armed = False
         self._allocate()
         self._lock = threading.Lock()
 
@@ -165,15 +180,54 @@ class Autopilot:
     def flies_with(self) -> int:
         """First IMU in use, from 0; -1: none."""
         return next(
-            (k for k in range(self.units) if self.parameters[PARAMETERS[k]]), -1
+            (k for k in range(self.units) if self.parameters.get(PARAMETERS[k], 1.0)),
+            -1,
         )
 
     @property
     def lanes(self) -> list[int]:
         """IMU that each EKF lane follows, from 0."""
-        used = [bool(self.parameters[name]) for name in PARAMETERS[: self.units]]
+        names = PARAMETERS[: self.units]
+        used = [bool(self.parameters.get(name, 1.0)) for name in names]
         own = [k for k in range(self.units) if self.has_lane >> k & 1]
         return [k if used[k] else self.flies_with for k in own]
+
+    def _fly(self, now: int, out: list[bytes]) -> None:
+        """Mislead the lanes by the errors of their IMUs until a time, ns."""
+        seconds = (now - self._flown_until) / NS if self._flown_until else 0.0
+        self._flown_until = now
+        if self.stack == "px4":
+            return
+        if self.armed and not self._was_armed:
+            self.say(6, "Arming motors", out)
+        self._was_armed = self.armed
+        if not self.armed:
+            self.misled[:] = 0.0
+            self.primary = int(self.parameters.get(EKF_PRIMARY, 0.0))
+            return
+        self.misled *= math.exp(-seconds / LANE_RECOVERY)
+        for lane, imu in enumerate(self.lanes):
+            self.misled[lane] += seconds * float(np.linalg.norm(self.bias[imu]))
+
+    def _change_lane(self, now: int, out: list[bytes]) -> None:
+        """Change to the best lane."""
+        self.lane_asks.append(now)
+        self._fly(now, out)
+        best = int(np.argmin(self.misled[: len(self.lanes)]))
+        is_better = self.misled[best] < self.misled[self.primary]
+        if is_better and now - self._lane_changed >= LANE_PAUSE:
+            self.change_primary(best, now, out)
+
+    def change_primary(self, lane: int, now: int, out: list[bytes]) -> None:
+        """Change to a lane, and say so."""
+        self.primary, self._lane_changed = lane, now
+        for severity, text in ((2, "EKF3 lane switch"), (4, "EKF primary changed:")):
+            words = f"{text} {lane}" if severity == 2 else f"{text}{lane}"
+            self.say(severity, words, out)
+
+    def say(self, severity: int, text: str, out: list[bytes]) -> None:
+        """Send a text."""
+        self._send(self.mav.statustext_encode(severity, text.encode()), out)
 
     def _allocate(self) -> None:
         known = [self.parameters.get(name, 0.0) for name in PARAMETERS[: self.units]]
@@ -220,6 +274,7 @@ class Autopilot:
 
     def _step(self, now: int) -> list[bytes]:
         out: list[bytes] = []
+        self._fly(now, out)
         if self._answers:
             for at, name, value in self._answers:
                 if at <= now:
@@ -297,7 +352,7 @@ class Autopilot:
         for message in self.inbound.parse_buffer(data) or []:
             name = message.get_type()
             if name == "COMMAND_LONG":
-                self._command(message, out)
+                self._command(message, now, out)
             elif name == "TIMESYNC" and message.tc1 == 0:
                 self._send(
                     self.mav.timesync_encode(self.clock(now) * 1000, message.ts1), out
@@ -345,13 +400,18 @@ class Autopilot:
             out,
         )
 
-    def _command(self, message, out: list[bytes]) -> None:
+    def _command(self, message, now: int, out: list[bytes]) -> None:
         self.commands.append(
             (message.command, int(message.param1), int(message.param2))
         )
         if message.target_system != self.system:
             return
         number, interval = int(message.param1), int(message.param2)
+        if message.command == DO_AUX_FUNCTION and number == LANE_SWITCH:
+            self._change_lane(now, out)
+            accepted = mavlink.MAV_RESULT_ACCEPTED
+            self._send(self.mav.command_ack_encode(message.command, accepted), out)
+            return
         known = MESSAGES.keys() - ({27} if self.stack == "px4" else set())
         if message.command != 511 or number not in known or number in self.refuses:
             self._send(
@@ -448,7 +508,7 @@ UTC = 1_790_000_000
 """Unix time at the start of the simulation, s."""
 STEP = NS // 1000  #: Of simulated time, ns.
 HARMLESS = {"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "STATUSTEXT", "NAMED_VALUE_FLOAT"}
-"""All that may be sent; of commands only the one for intervals."""
+"""All that may be sent; of commands only the one for intervals, and with failover the one for another EKF lane."""
 
 
 class Conversation:
@@ -496,11 +556,16 @@ class Conversation:
             self.may_set
             and (
                 message.param_id in PARAMETERS
-                or (message.get_type(), message.param_id)
-                == ("PARAM_REQUEST_READ", EKF_LANES)
+                or (
+                    message.get_type() == "PARAM_REQUEST_READ"
+                    and message.param_id in (EKF_LANES, EKF_PRIMARY)
+                )
             )
         )
-        assert message.get_type() != "COMMAND_LONG" or message.command == 511
+        if message.get_type() == "COMMAND_LONG" and message.command != 511:
+            function = (message.command, message.param1, message.param2)
+            assert self.may_set
+            assert function == (DO_AUX_FUNCTION, LANE_SWITCH, 2)
         assert message.get_type() != "TIMESYNC" or message.tc1 == 0
         assert message.get_type() != "HEARTBEAT" or message.autopilot == 8
         self.sent[message.get_type()] += 1

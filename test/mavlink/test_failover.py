@@ -30,6 +30,7 @@ from fdi_ros.mavlink.failover_words import Condition, imu_name, text_of
 from fdi_ros.system.clocks import Clocks
 from mavlink.autopilots import (
     EKF_LANES,
+    EKF_PRIMARY,
     NS,
     PARAMETERS,
     UTC,
@@ -261,6 +262,76 @@ def test_a_harmless_error_takes_no_slot(flying: Monitored) -> None:
     flying.fault(1, 1.0, seconds=0.5)
     assert flying.in_use == [False, True, True]
     assert not any(DANGER in text for text in flying.texts)
+
+
+def test_a_misled_primary_lane_is_left_after_the_order(flying: Monitored) -> None:
+    """Without it ArduCopter stayed on the lane, and lost 1.3 m of height."""
+    autopilot = flying.autopilots[0]
+    flying.fault(1, 0.5, seconds=0.6)
+    assert flying.in_use == [False, True, True]
+    assert autopilot.misled[0] > 0.02
+    flying.run(3.0)
+    assert autopilot.primary == 1
+    assert len(autopilot.lane_asks) == 1
+    flying.run(2.0)
+    flying.fault(2, [0.0, 0.0, 0.5], (OK, OK, FAULTY), 4.0)
+    assert flying.in_use == [False, False, True]
+    assert [autopilot.primary, len(autopilot.lane_asks)] == [2, 2]
+
+
+def test_the_lane_is_not_left_for_an_imu_that_it_does_not_run_on(
+    flying: Monitored,
+) -> None:
+    """The lane that the bad IMU misled just now may still have the better score."""
+    autopilot = flying.autopilots[0]
+    flying.fault(2, 0.5, seconds=5.0)
+    flying.heal(2, 8.0)
+    flying.fault(3, -0.5, seconds=5.0)
+    assert not autopilot.lane_asks
+    assert autopilot.primary == 0
+
+
+def test_a_lane_that_the_autopilot_has_left_by_itself_is_known(
+    flying: Monitored,
+) -> None:
+    autopilot = flying.autopilots[0]
+    out: list[bytes] = []
+    autopilot.change_primary(1, flying.now, out)
+    flying.inject(b"".join(out))
+    flying.fault(1, 0.5, seconds=5.0)
+    assert not autopilot.lane_asks
+    flying.heal(1, 8.0)
+    flying.fault(2, 0.5, seconds=5.0)
+    assert autopilot.lane_asks
+    assert autopilot.primary == 2
+
+
+@pytest.mark.parametrize("parameters", [{EKF_LANES: 6.0}, {EKF_PRIMARY: None}])
+def test_without_knowing_the_lanes_none_is_asked_for(
+    tmp_path: Path, parameters: dict[str, float | None]
+) -> None:
+    autopilot = Autopilot("ardupilot")
+    for name, value in parameters.items():
+        if value is None:
+            del autopilot.parameters[name]
+        else:
+            autopilot.parameters[name] = value
+    autopilot.reboot(autopilot.boot)
+    talk = Monitored(tmp_path, autopilot).run(10.0)
+    autopilot.armed = True
+    talk.run(3.0).fault(1, 0.5, seconds=5.0)
+    assert talk.in_use == [False, True, True]
+    assert not autopilot.lane_asks
+
+
+def test_after_a_silence_in_flight_no_lane_is_asked_for(flying: Monitored) -> None:
+    """A text may have been lost."""
+    flying.cut = True
+    flying.run(1.0)
+    flying.cut = False
+    flying.run(5.0).fault(1, 0.5, seconds=5.0)
+    assert flying.in_use == [False, True, True]
+    assert not flying.autopilots[0].lane_asks
 
 
 def test_two_bad_imus_are_both_out_and_the_last_one_stays(flying: Monitored) -> None:

@@ -1,0 +1,216 @@
+# Copyright 2026 fdi_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""When another EKF lane is asked for: only where ours has misled lane is known to be flown with."""
+
+from dataclasses import replace
+
+import pytest
+
+from fdi_ros.mavlink.failover_lane import LaneReport, LaneState, follow
+from fdi_ros.mavlink.failover_policy import Imu, Memory, PolicySettings, View
+
+MS = 1_000_000
+NS = 1000 * MS
+TICK = 20 * MS
+USED = Memory(seen=True)
+OUT = Memory(ours=True, held=True, seen=False)
+KNOWN = LaneReport(configured=0, lanes=3, is_complete=True, has_texts=True)
+
+
+class Lanes:
+    """Three IMUs in flight, with what the autopilot reports of its lanes."""
+
+    def __init__(self, report: LaneReport = KNOWN) -> None:
+        self.now = 100 * NS
+        self.state = LaneState()
+        self.report = report
+        self.memories = [replace(USED) for _ in range(3)]
+        imu = Imu(use=True, delivers=True, ok=True, size=0.0)
+        self.imus = [imu, imu, imu]
+        self.armed = False
+        self.linked = self.monitored = True
+        self.boots = 0
+        self.asked: list[int] = []  # ms since `mark`
+        self.mark = 0
+
+    def run(self, seconds: float, named: int | None = None) -> "Lanes":
+        """Fly on; a text names a lane at first."""
+        for _ in range(round(seconds * NS / TICK)):
+            self.now += TICK
+            view = View(
+                tuple(self.imus),
+                linked=self.linked,
+                armed=self.armed,
+                monitored=self.monitored,
+                boots=self.boots,
+            )
+            report = self.report._replace(named=named)
+            named = None
+            self.state, asks = follow(
+                self.state, report, self.memories, view, self.now, PolicySettings()
+            )
+            if asks:
+                self.asked.append((self.now - self.mark) // MS)
+        return self
+
+    def fly(self) -> "Lanes":
+        self.run(3.0)
+        self.armed = True
+        return self.run(3.0)
+
+    def out(self, *imus: int, seconds: float = 5.0) -> "Lanes":
+        """IMUs, from 0, are reported out after our order."""
+        for k in imus:
+            self.memories[k] = replace(OUT)
+        # The first tick that knows it.
+        self.mark = self.now + TICK
+        return self.run(seconds)
+
+
+def test_it_is_asked_four_times_within_two_seconds() -> None:
+    assert Lanes().fly().out(0, seconds=60.0).asked == [300, 600, 1000, 2000]
+
+
+@pytest.mark.parametrize("configured", [0, 1, 2])
+def test_only_the_imu_of_the_primary_lane_counts(configured: int) -> None:
+    for k in range(3):
+        lanes = Lanes(KNOWN._replace(configured=configured)).fly().out(k)
+        assert bool(lanes.asked) == (k == configured)
+
+
+def test_a_primary_lane_that_does_not_exist_is_the_first() -> None:
+    assert Lanes(KNOWN._replace(configured=5)).fly().out(0).asked
+
+
+def test_the_lane_that_a_text_has_named_counts() -> None:
+    assert not Lanes().fly().run(0.1, named=1).out(0).asked
+    assert Lanes().fly().run(0.1, named=1).out(1).asked
+
+
+def test_nothing_is_asked_after_the_lane_has_changed() -> None:
+    lanes = Lanes().fly().out(0, seconds=0.4)
+    assert lanes.asked == [300]
+    assert lanes.run(5.0, named=2).asked == [300]
+
+
+def test_a_lane_named_again_that_was_primary_is_no_change() -> None:
+    """ArduPilot sends two texts of each change."""
+    lanes = Lanes().fly().run(0.1, named=1).run(0.1, named=1).out(1)
+    assert lanes.asked == [300, 600, 1000, 2000]
+
+
+def test_a_lane_that_runs_on_another_imu_is_misled_by_that_one() -> None:
+    """IMU 1 is out, ArduPilot stays on its lane, which runs on IMU 2; then this one fails."""
+    lanes = Lanes().fly().out(0)
+    lanes.asked.clear()
+    assert lanes.out(1).asked == [300, 600, 1000, 2000]
+    other = Lanes().fly().out(0)
+    other.asked.clear()
+    assert not other.out(2).asked
+
+
+def test_an_imu_that_others_took_out_has_misled_nothing() -> None:
+    lanes = Lanes().fly()
+    lanes.memories[0] = Memory(seen=False)
+    assert not lanes.run(5.0).asked
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"configured": None},
+        {"lanes": 0},
+        {"lanes": 1},
+        {"is_complete": False},
+        {"has_texts": False},
+    ],
+)
+def test_nothing_is_asked_of_an_autopilot_whose_lanes_are_not_known(change) -> None:
+    assert not Lanes(KNOWN._replace(**change)).fly().out(0).asked
+
+
+@pytest.mark.parametrize("gap", [0.02, 3.0])
+def test_a_text_that_may_be_lost_makes_the_lane_unknown_until_one_names_it(
+    gap: float,
+) -> None:
+    lanes = Lanes().fly()
+    lanes.report = KNOWN._replace(is_complete=False)
+    lanes.run(gap)
+    lanes.report = KNOWN
+    assert not lanes.run(1.0).out(0).asked
+    named = lanes.run(0.1, named=1)
+    named.memories[0] = replace(USED)
+    assert named.out(1).asked
+
+
+def test_after_the_landing_the_lane_is_the_configured_one_again() -> None:
+    lanes = Lanes().fly().run(20.0, named=2)
+    lanes.armed = False
+    assert lanes.fly().out(0).asked
+    again = Lanes().fly().run(20.0, named=2)
+    again.armed = False
+    assert not again.fly().out(2).asked
+
+
+def test_a_text_outlives_a_heartbeat_from_before_arming() -> None:
+    lanes = Lanes().run(3.0).run(0.5, named=1)
+    lanes.armed = True
+    assert lanes.run(1.0).out(1).asked
+
+
+def test_a_start_in_flight_knows_no_lane() -> None:
+    lanes = Lanes()
+    lanes.armed = True
+    assert not lanes.run(3.0).out(0).asked
+
+
+def test_a_start_of_the_autopilot_is_forgotten_with_its_lanes() -> None:
+    lanes = Lanes().fly()
+    lanes.boots = 1
+    assert not lanes.run(1.0).out(0).asked
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        {"size": 0.03},
+        {"size": float("nan")},
+        {"stuck": True},
+        {"delivers": False},
+    ],
+)
+@pytest.mark.parametrize("imu", [1, 2])
+def test_nothing_is_asked_while_an_imu_in_use_may_be_bad(imu: int, state) -> None:
+    lanes = Lanes().fly()
+    lanes.imus[imu] = lanes.imus[imu]._replace(**state)
+    assert not lanes.out(0).asked
+
+
+def test_what_is_not_allowed_when_due_is_left_out() -> None:
+    lanes = Lanes().fly()
+    fine = lanes.imus[1]
+    lanes.imus[1] = fine._replace(size=0.1)
+    lanes.out(0, seconds=0.8)
+    lanes.imus[1] = fine
+    assert lanes.run(5.0).asked == [1000, 2000]
+
+
+@pytest.mark.parametrize("name", ["linked", "monitored", "armed"])
+def test_nothing_is_asked_without_link_monitor_or_flight(name: str) -> None:
+    lanes = Lanes().fly()
+    setattr(lanes, name, False)
+    assert not lanes.out(0).asked
+
+
+def test_with_no_other_lane_on_an_imu_in_use_nothing_is_asked() -> None:
+    """IMU 3, the last one in use, has no lane."""
+    assert not Lanes(KNOWN._replace(lanes=2)).fly().out(0, 1).asked
+    assert Lanes(KNOWN._replace(lanes=2)).fly().out(0).asked
+
+
+def test_an_imu_that_is_back_before_the_end_is_still_asked_for() -> None:
+    """The lane is misled, whether its IMU is back or not."""
+    lanes = Lanes().fly().out(0, seconds=0.5)
+    lanes.memories[0] = replace(USED)
+    assert lanes.run(5.0).asked == [300, 600, 1000, 2000]
