@@ -38,7 +38,7 @@ from fdi_ros.mavlink.protocol import MS, NS
 
 #: Times from the report that the IMU is out, ns. The scores of the lanes need about 0.3 s.
 ASK_AFTER = (300 * MS, 600 * MS, NS, 2 * NS)
-#: A heartbeat may be from before a lane was named for this time, ns.
+#: For this time, ns, a lane that a text has named may be newer than the heartbeat "disarmed".
 HEARTBEAT_AGE = 2 * NS
 
 
@@ -58,7 +58,7 @@ class LaneState(NamedTuple):
 
     #: Lane that the autopilot flies with. None: unknown.
     primary: int | None = None
-    named_at: int = LONG_AGO  #: When a text last named it.
+    named_at: int = LONG_AGO  #: When a text last named it, before a heartbeat "armed".
     source: int | None = None  #: IMU, from 0, that this lane runs on. None: unknown.
     #: When the IMU that this lane ran on was reported out by our order. None: it was not.
     misled_at: int | None = None
@@ -80,7 +80,7 @@ def follow(
     """
     if view.boots != state.boots:
         state = LaneState(boots=view.boots)
-    if report.named is not None:
+    if report.named is not None and not view.armed:
         state = state._replace(named_at=now)
     primary = _primary(state, report, view, now)
     source = _source(primary, memories)

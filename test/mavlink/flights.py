@@ -20,6 +20,13 @@ from typing import NoReturn, Protocol
 import numpy as np
 
 from fdi_ros.mavlink.failover import READ_EVERY, READ_HURRIED
+from fdi_ros.mavlink.failover_lane import (
+    ASK_AFTER,
+    HEARTBEAT_AGE,
+    LaneReport,
+    LaneState,
+    follow,
+)
 from fdi_ros.mavlink.failover_policy import (
     FRESH,
     GROUNDED,
@@ -64,6 +71,9 @@ class Flight:
         self.is_without = False  # no IMU is in use
         self.without_any = 0  # for how long, since the link was there, ns
         self.taken_by_others = -NS  # when a station last took an IMU out of use, ns
+        self.primary = 0  # EKF lane that the vehicle flies with
+        self.lane_changed = 0  # when it changed, or the vehicle was disarmed, ns
+        self.lane_misled = -NS  # when we last took the IMU of this lane out, ns
         # The policy's view.
         self.named = [False for _ in every]
         self.agreed: list[int | None] = [0 for _ in every]
@@ -75,6 +85,8 @@ class Flight:
         self.restore = self.hurry = False
         self.disarmed = self.landed = 0
         self.read_at = 0
+        self.lane = LaneState()
+        self.lane_named: int | None = None  # by a text, since the last step
 
     def draw(self, rate: float) -> bool:
         """Whether an event of this rate, 1/s, happens in this step."""
@@ -108,9 +120,30 @@ class Flight:
         """A PARAM_SET has arrived."""
         if by == OTHERS and self.use[k] and not use:
             self.taken_by_others = self.now
+        if by == OURS and not use and k == self.source:
+            self.lane_misled = self.now
         self.use[k] = use
         self.by[k] = by
         self.report(k, use)
+
+    @property
+    def source(self) -> int:
+        """IMU that the primary EKF lane runs on. -1: none is in use."""
+        if self.use[self.primary]:
+            return self.primary
+        return self.use.index(True) if any(self.use) else -1
+
+    def change_lane(self, lane: int) -> None:
+        """The autopilot flies with another lane, and says so twice."""
+        self.primary = lane
+        self.lane_changed = self.now
+        self.lane_misled = -NS
+
+        def arrive() -> None:
+            self.lane_named = lane
+
+        for _ in range(2):
+            self.travel(arrive)
 
     def happen(self) -> None:
         """Events that nobody has asked for."""
@@ -133,11 +166,17 @@ class Flight:
         self.linked ^= self.draw(0.05 if self.linked else 1.0)
         self.monitored ^= self.draw(0.05 if self.monitored else 1.0)
         self.armed ^= self.draw(0.02 if self.armed else 0.5)
+        if not self.armed:
+            self.primary = 0
+            self.lane_changed = self.now
+        elif self.draw(0.05):
+            self.change_lane(k)
         self.restore = self.draw(0.02)
         if self.draw(0.01):
             # The companion starts anew: its file says which IMUs are ours.
             ours = [j for j, one in enumerate(self.state.memories) if one.ours]
             self.state = PolicyState.begin(self.count, ours)
+            self.lane = LaneState()
             self.told = [(None, 0)] * self.count
             self.boots = 0
         if not self.armed and self.draw(0.1):
@@ -218,7 +257,43 @@ class Flight:
             self.check_order(order, view)
             self.done["in use" if order.use else "out of use"] += 1
             self.travel(lambda order=order: self.set_use(*order, by=OURS))
+        self.follow_lane(view)
         self.check_vehicle()
+
+    def follow_lane(self, view: View) -> None:
+        """Ask for another EKF lane where that is due."""
+        report = LaneReport(
+            named=self.lane_named,
+            configured=0,
+            lanes=self.count,
+            is_complete=self.linked and not self.loss,
+            has_texts=True,
+        )
+        self.lane_named = None
+        memories = self.state.memories
+        self.lane, asks = follow(
+            self.lane, report, memories, view, self.now, self.settings
+        )
+        if asks:
+            self.check_ask()
+            self.done["lane"] += 1
+            self.travel(self.change_lane_if_better)
+
+    def change_lane_if_better(self) -> None:
+        """An ask for another lane has arrived."""
+        if self.armed and self.now - self.lane_changed >= 5 * NS:
+            self.change_lane(int(self.random.integers(self.count)))
+
+    def check_ask(self) -> None:
+        """Check that our order took out the IMU of the lane that the vehicle flies with."""
+        assert self.armed
+        assert self.monitored
+        trip = 2 * self.slow + LATE_ANSWER + 2 * STEP
+        if self.now - self.lane_changed <= HEARTBEAT_AGE + trip:
+            # The text is still under way.
+            return
+        assert self.lane.primary == self.primary
+        assert self.now - self.lane_misled <= ASK_AFTER[-1] + FRESH + trip
 
     def check_order(self, order: Order, view: View) -> None:
         """Check an order against the truth when it is sent."""
