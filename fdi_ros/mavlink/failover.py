@@ -30,7 +30,6 @@ from fdi_ros.mavlink.failover_ready import (
     EKF_LANES,
     EKF_PRIMARY,
     INS_USE,
-    LARGEST_LOSS,
     Facts,
     doubt,
     not_again,
@@ -127,6 +126,7 @@ class Failover:
         self._lanes: int | None = None  # of `EKF_LANES`. None: not reported
         self._primary: int | None = None  # of `EKF_PRIMARY`. None: not reported
         self._lane = LaneState()
+        self._breaks = 0  # of the vehicle, until the last turn
         self._conversation = 0
         self._boots = 0
         self._booted: int | None = None  # when the autopilot started, ns
@@ -211,7 +211,8 @@ class Failover:
         vehicle = self._vehicle
         silence = now - vehicle.heard
         count = len(view.imus)
-        mask = self._lanes or 0
+        # Others than ArduCopter do not name the lane that they return to when disarmed.
+        mask = self._lanes if self._lanes and vehicle.is_copter else 0
         named = None
         while vehicle.lanes:
             named = vehicle.lanes.popleft()
@@ -220,9 +221,10 @@ class Failover:
             configured=self._primary,
             # Without a lane for one IMU, the next one has its number.
             lanes=next((k for k in range(count) if not mask >> k & 1), count),
-            is_complete=silence < SILENCE and self._lost <= LARGEST_LOSS,
+            is_complete=silence < SILENCE and vehicle.breaks == self._breaks,
             has_texts=vehicle.texts > 0,
         )
+        self._breaks = vehicle.breaks
         memories = self._state.memories
         self._lane, asks = follow(
             self._lane, report, memories, view, now, self._settings

@@ -1,25 +1,28 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""When to ask an ArduPilot for another EKF lane: a pure function, called at every tick.
+"""When to ask an ArduCopter for another EKF lane: a pure function, called at every tick.
 
 ArduPilot flies with the gyro of its primary lane. Lane k runs on IMU k, or on the first
 IMU in use while IMU k is out. A bad IMU misleads its lane until the IMU is out. The lane
 then runs on with a wrong attitude, and ArduPilot often stays on it, as the error is below
 its own limits.
 
-The auxiliary function `vehicle.LANE_SWITCH` makes ArduPilot change to the lane with the best
-score. ArduPilot calls the same function before its EKF failsafe. Beside a healthy primary
-lane it can do harm: a lane that was misled just now still has a good score. So it is asked
-for only if all of this holds:
+The auxiliary function `vehicle.LANE_SWITCH` makes ArduPilot change to the healthy lane with
+the lowest error score, if that is lower than the one of the primary lane. ArduCopter calls
+the same function before its EKF failsafe. Beside a healthy primary lane it can do harm: a
+lane that was misled just now still has a low score. So failover asks for it only if all of
+this holds:
 
 1. The IMU that the primary lane ran on has gone out by our order, reported by the autopilot.
 2. The primary lane is known, and has not changed since then.
 3. Every IMU in use is alive and agrees with the others, and one of them has another lane.
-4. The vehicle is armed, heard, and monitored.
+4. No other lane was misled within `SCORED`.
+5. The vehicle is armed, heard, and monitored.
 
-It is asked for at the times `ASK_AFTER` from the report. What is not allowed then is left
-out. ArduPilot itself changes its lane at most once in 5 s, and not if no lane is better.
+The asks are due at the times `ASK_AFTER` from the report. An ask that is not allowed when
+due is left out. ArduPilot answers this function at most once in 5 s, which begin with any
+change of its lane.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from typing import NamedTuple
 
 from fdi_ros.mavlink.failover_policy import (
     LONG_AGO,
+    Imu,
     Memory,
     PolicySettings,
     View,
@@ -36,8 +40,11 @@ from fdi_ros.mavlink.failover_policy import (
 )
 from fdi_ros.mavlink.protocol import MS, NS
 
-#: Times from the report that the IMU is out, ns. The scores of the lanes need about 0.3 s.
-ASK_AFTER = (300 * MS, 600 * MS, NS, 2 * NS)
+#: Times from the report that the IMU is out, ns. The scores of the lanes need some 0.3 s to
+#: differ. The last time is after the 5 s of ArduPilot.
+ASK_AFTER = (300 * MS, 600 * MS, NS, 2 * NS, 3 * NS, 4 * NS, 5500 * MS)
+TOO_LATE = 6 * NS  #: After this time from the report nothing is asked, ns.
+SCORED = NS  #: A lane that was misled has a high score after this time, ns.
 #: For this time, ns, a lane that a text has named may be newer than the heartbeat "disarmed".
 HEARTBEAT_AGE = 2 * NS
 
@@ -61,8 +68,10 @@ class LaneState(NamedTuple):
     named_at: int = LONG_AGO  #: When a text last named it, before a heartbeat "armed".
     source: int | None = None  #: IMU, from 0, that this lane runs on. None: unknown.
     #: When the IMU that this lane ran on was reported out by our order. None: it was not.
-    misled_at: int | None = None
+    out_at: int | None = None
     asks: int = 0  #: Number of times `ASK_AFTER` that have passed since then.
+    #: When the IMU that each lane runs on was last bad.
+    misled_at: tuple[int, ...] = ()
     boots: int = 0  #: Number of starts of the autopilot seen at the last tick.
 
 
@@ -83,21 +92,22 @@ def follow(
     if report.named is not None and not view.armed:
         state = state._replace(named_at=now)
     primary = _primary(state, report, view, now)
-    source = _source(primary, memories)
     is_same = primary is not None and primary == state.primary and view.armed
-    misled_at = state.misled_at if is_same else None
-    asks = state.asks
+    out_at = state.out_at if is_same else None
     if is_same and _is_out(state.source, memories):
-        misled_at = now
-        asks = 0
-    passed = 0
-    if misled_at is not None:
-        passed = sum(now - misled_at >= after for after in ASK_AFTER)
-    ask = passed > asks and _may_ask(primary, report, memories, view, settings)
+        out_at = now
+    elapsed = -1 if out_at is None else now - out_at
+    passed = sum(elapsed >= after for after in ASK_AFTER)
+    is_due = passed > (state.asks if out_at == state.out_at else 0)
     state = state._replace(
-        primary=primary, source=source, misled_at=misled_at, asks=passed
+        primary=primary,
+        source=_source(primary, memories),
+        out_at=out_at,
+        asks=passed,
+        misled_at=_misled_at(state, memories, view, now, settings),
     )
-    return state, ask
+    is_in_time = is_due and elapsed < TOO_LATE
+    return state, is_in_time and _may_ask(state, report, memories, view, now, settings)
 
 
 def _primary(state: LaneState, report: LaneReport, view: View, now: int) -> int | None:
@@ -105,22 +115,21 @@ def _primary(state: LaneState, report: LaneReport, view: View, now: int) -> int 
 
     While disarmed ArduPilot returns to the lane of EK3_PRIMARY.
     """
-    count = report.lanes
     if report.named is not None:
-        return report.named if report.named < count else None
+        return report.named if report.named < report.lanes else None
     if not report.is_complete:
         return None
     if view.armed or now - state.named_at < HEARTBEAT_AGE:
         return state.primary
-    if report.configured is None or not count:
+    if report.configured is None:
         return None
-    return report.configured if 0 <= report.configured < count else 0
+    return report.configured if report.configured < report.lanes else 0
 
 
-def _source(primary: int | None, memories: Sequence[Memory]) -> int | None:
-    """Return the IMU that the primary lane runs on. None: unknown."""
-    if primary is None or memories[primary].seen is not False:
-        return primary
+def _source(lane: int | None, memories: Sequence[Memory]) -> int | None:
+    """Return the IMU that a lane runs on. None: unknown."""
+    if lane is None or memories[lane].seen is not False:
+        return lane
     return next((k for k, memory in enumerate(memories) if memory.seen), None)
 
 
@@ -129,21 +138,45 @@ def _is_out(imu: int | None, memories: Sequence[Memory]) -> bool:
     return imu is not None and memories[imu].ours and memories[imu].seen is False
 
 
+def _is_fine(imu: Imu, settings: PolicySettings) -> bool:
+    """Return whether an IMU measures, as far as can be known. Of unknown size: no."""
+    return is_alive(imu) and imu.size < settings.min_size
+
+
+def _misled_at(
+    state: LaneState,
+    memories: Sequence[Memory],
+    view: View,
+    now: int,
+    settings: PolicySettings,
+) -> tuple[int, ...]:
+    """Return when the IMU that each lane runs on was last not known to be fine, ns."""
+    known = state.misled_at or (LONG_AGO,) * len(memories)
+    sources = [_source(lane, memories) for lane in range(len(memories))]
+    return tuple(
+        at if source is not None and _is_fine(view.imus[source], settings) else now
+        for source, at in zip(sources, known, strict=True)
+    )
+
+
 def _may_ask(
-    primary: int | None,
+    state: LaneState,
     report: LaneReport,
     memories: Sequence[Memory],
     view: View,
+    now: int,
     settings: PolicySettings,
 ) -> bool:
-    """Return whether another lane is sure to be fine, as far as can be known."""
-    in_use = [k for k, memory in enumerate(memories) if memory.seen and not memory.ours]
-    is_fine = all(
-        is_alive(view.imus[k]) and view.imus[k].size < settings.min_size for k in in_use
+    """Return whether the autopilot can only change to a better lane, as far as can be known."""
+    others = [lane for lane in range(report.lanes) if lane != state.primary]
+    # An order that is not confirmed leaves its IMU in use.
+    used = [k for k, memory in enumerate(memories) if memory.seen is not False]
+    checks = (
+        view.linked,
+        view.monitored,
+        report.has_texts,
+        any(memories[lane].seen for lane in others),
+        all(_is_fine(view.imus[k], settings) for k in used),
+        all(now - state.misled_at[lane] >= SCORED for lane in others),
     )
-    is_watched = view.armed and view.linked and view.monitored and report.has_texts
-    return (
-        is_watched
-        and is_fine
-        and any(k != primary and k < report.lanes for k in in_use)
-    )
+    return all(checks)

@@ -60,8 +60,21 @@ _LEFT = 1 << 12
 DENIED = re.compile(r"Param write denied \((\w+)\)")
 #: ArduPilot's texts where its primary EKF lane has changed, of the EKF and of the vehicle.
 LANE_CHANGED = re.compile(r"EKF3 lane switch (\d+)|EKF primary changed:(\d+)")
+#: Texts of each change of the lane: one is lost without notice only with the other.
+LANE_TEXTS = 2
 LANE_SWITCH = 103  #: RC option and auxiliary function "EKF lane switch" of ArduPilot.
 SWITCH_HIGH = 2  #: Position of the switch of an auxiliary function.
+#: Vehicles that fly ArduCopter, by their MAV_TYPE. Others send one text of a change only.
+COPTERS = (
+    "COAXIAL",
+    "DECAROTOR",
+    "DODECAROTOR",
+    "HELICOPTER",
+    "HEXAROTOR",
+    "OCTOROTOR",
+    "QUADROTOR",
+    "TRICOPTER",
+)
 TWO_SENDERS = (
     "two senders as system {} behind one address: two autopilots with one id, or two"
     " links of one"
@@ -194,6 +207,7 @@ class Vehicle:
         self._behind_from: Any = None
         self._mavlink = dialect()
         self._component = self._mavlink.MAV_COMP_ID_AUTOPILOT1
+        self._copters = {getattr(self._mavlink, f"MAV_TYPE_{name}") for name in COPTERS}
         self._send = send
         self._seconds = seconds
         self._verifier = Verifier(settings.key, times) if settings.key else None
@@ -230,6 +244,9 @@ class Vehicle:
         #: Parameters that the autopilot has refused to set.
         self.denied: deque[str] = deque(maxlen=64)
         self.texts = 0  #: Number of texts received.
+        #: How often `LANE_TEXTS` messages or more in a row were lost, or came late.
+        self.breaks = 0
+        self.is_copter = False  #: Flies ArduCopter, by its last heartbeat.
         #: EKF lanes that became primary, from texts. The reader takes them out.
         self.lanes: deque[int] = deque(maxlen=64)
         self._found = self._first_imu = 0
@@ -400,6 +417,7 @@ class Vehicle:
         if beats:
             self.autopilot = message.autopilot
             self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            self.is_copter = message.type in self._copters
             self._disarmed_at = None if self.armed else self._disarmed_at or now
             self.disarmed = now - (self._disarmed_at or now)
         return True
@@ -445,6 +463,7 @@ class Vehicle:
         self.counts["in use"] += 1
         gap = 0 if self._sequence is None else (sequence - self._sequence - 1) & 255
         is_new = gap < 128
+        self.breaks += gap >= LANE_TEXTS
         self.counts["lost"] += gap if is_new else 0
         self._late = 0 if is_new else self._late + 1
         if is_new or self._late > MOST_LATE:

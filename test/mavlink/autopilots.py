@@ -142,6 +142,7 @@ class Autopilot:
     hears_sets: bool = True  # a router may drop PARAM_SET, and pass all else
     armed: bool = False
     sent: int = 0
+    vehicle: int = mavlink.MAV_TYPE_QUADROTOR
     late_reads: int = 0  # ns by which an answer to a read is late
     bias: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     """Errors of the gyros, (IMU, axis) rad/s in FRD."""
@@ -289,7 +290,7 @@ class Autopilot:
             )
             mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
             self._send(
-                self.mav.heartbeat_encode(mavlink.MAV_TYPE_QUADROTOR, kind, mode, 0, 4),
+                self.mav.heartbeat_encode(self.vehicle, kind, mode, 0, 4),
                 out,
             )
         if self.stack == "px4" and now - self._asked >= NS // 10:

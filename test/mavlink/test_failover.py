@@ -20,6 +20,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink import kept_file
@@ -324,14 +325,73 @@ def test_without_knowing_the_lanes_none_is_asked_for(
     assert not autopilot.lane_asks
 
 
-def test_after_a_silence_in_flight_no_lane_is_asked_for(flying: Monitored) -> None:
-    """A text may have been lost."""
+@pytest.mark.parametrize("gap", [0.02, 0.3, 0.42, 0.48, 1.0])
+def test_after_a_gap_in_flight_no_lane_is_asked_for_until_one_is_named(
+    flying: Monitored, gap: float
+) -> None:
+    """Both texts of a change may have been lost; from 0.4 s on the numbers look late."""
+    autopilot = flying.autopilots[0]
     flying.cut = True
-    flying.run(1.0)
+    flying.run(gap)
+    autopilot.change_primary(1, flying.now, [])
     flying.cut = False
-    flying.run(5.0).fault(1, 0.5, seconds=5.0)
+    flying.run(6.0).fault(1, 0.5, seconds=5.0)
     assert flying.in_use == [False, True, True]
-    assert not flying.autopilots[0].lane_asks
+    assert not autopilot.lane_asks
+    flying.heal(1, 8.0)
+    out: list[bytes] = []
+    autopilot.change_primary(2, flying.now, out)
+    flying.inject(b"".join(out))
+    flying.run(6.0).fault(3, 0.5, seconds=5.0)
+    assert autopilot.lane_asks
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_one_text_of_a_change_suffices(flying: Monitored, lost: int) -> None:
+    autopilot = flying.autopilots[0]
+    out: list[bytes] = []
+    autopilot.change_primary(1, flying.now, out)
+    del out[lost]
+    flying.inject(b"".join(out))
+    flying.run(6.0).fault(2, 0.5, seconds=3.0)
+    assert autopilot.lane_asks
+    assert autopilot.primary == 0
+
+
+def test_a_text_that_comes_late_names_no_lane(flying: Monitored) -> None:
+    """It may be from before the last change."""
+    autopilot = flying.autopilots[0]
+    old: list[bytes] = []
+    autopilot.change_primary(1, flying.now, old)
+    new: list[bytes] = []
+    autopilot.change_primary(0, flying.now, new)
+    flying.inject(b"".join(new + old))
+    flying.run(6.0).fault(2, 0.5, seconds=5.0)
+    assert flying.in_use == [True, False, True]
+    assert not autopilot.lane_asks
+
+
+def test_of_other_vehicles_than_copters_no_lane_is_asked_for(tmp_path: Path) -> None:
+    """They do not name the lane to which they return when disarmed."""
+    autopilot = Autopilot("ardupilot", vehicle=mavlink.MAV_TYPE_FIXED_WING)
+    talk = Monitored(tmp_path, autopilot).run(10.0)
+    autopilot.armed = True
+    talk.run(3.0).fault(1, 0.5, seconds=5.0)
+    assert talk.in_use == [False, True, True]
+    assert not autopilot.lane_asks
+
+
+def test_without_any_text_of_the_autopilot_no_lane_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A router may drop them."""
+    autopilot = Autopilot("ardupilot")
+    monkeypatch.setattr(autopilot, "say", lambda *_: None)
+    talk = Monitored(tmp_path, autopilot).run(10.0)
+    autopilot.armed = True
+    talk.run(3.0).fault(1, 0.5, seconds=5.0)
+    assert talk.in_use == [False, True, True]
+    assert not autopilot.lane_asks
 
 
 def test_two_bad_imus_are_both_out_and_the_last_one_stays(flying: Monitored) -> None:
