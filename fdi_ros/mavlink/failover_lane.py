@@ -16,8 +16,8 @@ this holds:
 
 1. The IMU that the primary lane ran on has gone out by our order, reported by the autopilot.
 2. The primary lane is known, and has not changed since then.
-3. Every IMU in use is alive and agrees with the others, and one of them has another lane.
-4. No other lane was misled within `SCORED`.
+3. Another lane has its own IMU in use.
+4. Each IMU on which another lane runs, or ran within `SCORED`, is alive and does not differ.
 5. The vehicle is armed, heard, and monitored.
 
 The asks are due at the times `ASK_AFTER` from the report. An ask that is not allowed when
@@ -98,7 +98,7 @@ def follow(
         out_at = now
     elapsed = -1 if out_at is None else now - out_at
     passed = sum(elapsed >= after for after in ASK_AFTER)
-    is_due = passed > (state.asks if out_at == state.out_at else 0)
+    is_due = passed > state.asks
     state = state._replace(
         primary=primary,
         source=_source(primary, memories),
@@ -169,14 +169,11 @@ def _may_ask(
 ) -> bool:
     """Return whether the autopilot can only change to a better lane, as far as can be known."""
     others = [lane for lane in range(report.lanes) if lane != state.primary]
-    # An order that is not confirmed leaves its IMU in use.
-    used = [k for k, memory in enumerate(memories) if memory.seen is not False]
     checks = (
         view.linked,
         view.monitored,
         report.has_texts,
         any(memories[lane].seen for lane in others),
-        all(_is_fine(view.imus[k], settings) for k in used),
         all(now - state.misled_at[lane] >= SCORED for lane in others),
     )
     return all(checks)

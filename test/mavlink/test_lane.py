@@ -86,8 +86,9 @@ def test_only_the_imu_of_the_primary_lane_counts(configured: int) -> None:
         assert bool(lanes.asked) == (k == configured)
 
 
-def test_a_primary_lane_that_does_not_exist_is_the_first() -> None:
-    assert Lanes(KNOWN._replace(configured=5)).fly().out(0).asked
+@pytest.mark.parametrize("configured", [3, 255])
+def test_a_primary_lane_that_does_not_exist_is_the_first(configured: int) -> None:
+    assert Lanes(KNOWN._replace(configured=configured)).fly().out(0).asked
 
 
 def test_the_lane_that_a_text_has_named_counts() -> None:
