@@ -5,7 +5,7 @@
 
 Settings come from the parameter file of the monitor, so both have the same units. Nothing
 that the node sends commands the vehicle, except `failover`: it sets which IMUs of an
-ArduPilot are in use.
+ArduPilot are in use, and may ask an ArduCopter for another EKF lane.
 """
 
 from __future__ import annotations

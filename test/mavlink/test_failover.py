@@ -346,6 +346,17 @@ def test_after_a_gap_in_flight_no_lane_is_asked_for_until_one_is_named(
     assert autopilot.lane_asks
 
 
+@pytest.mark.parametrize("lost", [1, 2])
+def test_two_lost_messages_in_a_row_may_be_the_texts_and_one_is_not(
+    flying: Monitored, lost: int
+) -> None:
+    autopilot = flying.autopilots[0]
+    autopilot.mav.seq = (autopilot.mav.seq + lost) % 256
+    flying.run(1.0).fault(1, 0.5, seconds=3.0)
+    assert flying.in_use == [False, True, True]
+    assert bool(autopilot.lane_asks) == (lost == 1)
+
+
 @pytest.mark.parametrize("lost", [0, 1])
 def test_one_text_of_a_change_suffices(flying: Monitored, lost: int) -> None:
     autopilot = flying.autopilots[0]
