@@ -135,6 +135,8 @@ class Flight:
 
     def change_lane(self, lane: int) -> None:
         """The autopilot flies with another lane, and says so twice."""
+        if lane == self.primary:
+            return
         self.primary = lane
         self.lane_changed = self.now
         self.lane_misled = -NS
@@ -286,14 +288,15 @@ class Flight:
 
     def check_ask(self) -> None:
         """Check that our order took out the IMU of the lane that the vehicle flies with."""
-        assert self.armed
-        assert self.monitored
+        assert self.armed, "asks on the ground"
+        assert self.monitored, "asks unmonitored"
         trip = 2 * self.slow + LATE_ANSWER + 2 * STEP
         if self.now - self.lane_changed <= HEARTBEAT_AGE + trip:
             # The text is still under way.
             return
-        assert self.lane.primary == self.primary
-        assert self.now - self.lane_misled <= ASK_AFTER[-1] + FRESH + trip
+        assert self.lane.primary == self.primary, "asks for a healthy lane's change"
+        since = self.now - self.lane_misled
+        assert since <= ASK_AFTER[-1] + FRESH + trip, "the lane was not misled by ours"
 
     def check_order(self, order: Order, view: View) -> None:
         """Check an order against the truth when it is sent."""
