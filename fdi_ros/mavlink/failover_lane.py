@@ -127,8 +127,13 @@ def _primary(state: LaneState, report: LaneReport, view: View, now: int) -> int 
 
 
 def _source(lane: int | None, memories: Sequence[Memory]) -> int | None:
-    """Return the IMU that a lane runs on. None: unknown."""
-    if lane is None or memories[lane].seen is not False:
+    """Return the IMU that a lane runs on. None: unknown, as after a start of the autopilot.
+
+    An IMU that was out before that start has misled nothing.
+    """
+    if lane is None or memories[lane].seen is None:
+        return None
+    if memories[lane].seen:
         return lane
     return next((k for k, memory in enumerate(memories) if memory.seen), None)
 

@@ -278,10 +278,11 @@ def test_nothing_is_asked_long_after_the_report() -> None:
     assert not late.run(5.0).asked
 
 
-def test_an_imu_that_was_not_reported_yet_has_its_lane() -> None:
+def test_an_imu_that_was_out_before_a_start_has_misled_nothing() -> None:
+    """Its first report since then is no consequence of an order."""
     lanes = Lanes().fly()
-    lanes.memories[0] = Memory()
-    assert lanes.run(1.0).out(0).asked == ALL
+    lanes.memories[0] = Memory(ours=True, held=True)
+    assert not lanes.run(1.0).out(0).asked
 
 
 def test_a_lane_that_is_not_of_this_vehicle_makes_the_primary_one_unknown() -> None:
