@@ -33,6 +33,12 @@ from fdi_ros.mavlink.failover_raw import (
     nearest_zero,
     shift,
 )
+from fdi_ros.mavlink.failover_wrong import (
+    ALIKE_SHARES,
+    HEALTHY_SCALE,
+    WITHOUT_SCALE,
+    Wrong,
+)
 from fdi_ros.mavlink.protocol import MS, NS, Vector
 
 #: Time constant with which the recent largest size decays, s. Once the IMU has agreed
@@ -53,9 +59,6 @@ SUSPECT_STANDS = NS  #: An IMU must be suspected, and the odd one, for this time
 #: Difference from which the odd IMU needs no doubt of the monitor, rad/s. The monitor takes
 #: 0.2 s to exclude a spike. An autopilot whose primary gyro reads zero is at 50 deg then.
 CLEAR_DIFFERENCE = 0.5
-#: Share of the rate by which two healthy gyros may differ: scales of one type differ by up
-#: to 3 %, which is more than `CLEAR_DIFFERENCE` in a turn of 17 rad/s.
-SCALE = 0.05
 #: An IMU that the monitor doubts agrees only while the difference scatters by less, rad/s.
 CALM = 0.1
 #: An IMU agrees, and is trusted, only once another one has turned by this on average, rad/s: a
@@ -65,22 +68,9 @@ TURN_RATE = 0.1
 #: rate, would be this multiple of ``min_size``, and at least one in which this was so of a
 #: dead gyro.
 SHOWN = 2.0
-#: Or a turn at this part of the rate at which it was seen to be bad. At 0.4 gyros that have
-#: lost a part of their scale agree for 13 % of the time, now for 5 %. At 1.0 half of the
-#: healed ones stay out in a circle.
-SAME_TURN = 0.8
-#: Two have lost similar parts of their scales if these differ by this or less.
-ALIKE_SHARES = 0.2
-#: Largest such part that is lost. One that has lost more does not move, and a gyro with an error in a hover
-#: differs from all others by its whole rate.
-MOST_ALIKE = 0.85
-#: A larger share was no error of scale, but one at rest, too.
-MOST_SHARE = 1.2
 #: The same with the range of the driver set wrong: 2000 deg/s in place of 250 reads 8 times the
 #: rate, an error of 7 times the rate.
 MOST_RANGE_SHARE = 7.0
-STEP = 1.25  #: Ratio of two steps in which the file keeps how an IMU was bad.
-TINY = 1e-3  #: Resolution of the messages, rad/s.
 #: An axis moves if its mean rate and the one of another IMU change alike, by this or more, rad/s. A
 #: steady rate is no motion: both axes may be stuck at it.
 MOVED_BY_RAD_S = 0.005
@@ -143,63 +133,6 @@ class Partners(NamedTuple):
 NO_PARTNERS = Partners()
 
 
-class Wrong(NamedTuple):
-    """How one axis of an IMU was bad."""
-
-    rate: float  #: Largest rate of the others about it then, rad/s.
-    share: float  #: Largest ratio of error and rate: 1 for a gyro without scale.
-
-    @property
-    def is_of_scale(self) -> bool:
-        """Whether it may have been an error of scale."""
-        return self.share <= MOST_SHARE
-
-    def with_error(self, size: float, rate: float) -> Wrong:
-        """Return how it was bad, after an error of a size, rad/s, at a rate, rad/s."""
-        share = size / max(rate, TINY)
-        if self == WITHOUT_SCALE:
-            # That was no measurement.
-            return Wrong(rate, share)
-        return Wrong(max(rate, self.rate), max(share, self.share))
-
-    def in_steps(self) -> Wrong:
-        """Return it with at least this rate and at most this share, in steps of `STEP`.
-
-        So a turn that shows this shows also what it was, and small changes are none.
-        """
-        if self in (WITHOUT_SCALE, UNKNOWN):
-            return self
-        rate, share = (math.log(max(value, TINY), STEP) for value in self)
-        # One that is a step already stays one.
-        rate = STEP ** math.ceil(rate - TINY) if math.isfinite(rate) else rate
-        return Wrong(rate, STEP ** math.floor(share + TINY))
-
-    def shown_by(self, dead: float) -> float:
-        """Return the least turn that shows it, rad/s. dead: the same of a gyro without scale."""
-        return max(dead, min(SAME_TURN * self.rate, dead / self.share))
-
-    def explains(self, rate: float, other: float, min_size: float) -> bool:
-        """Return whether another rate, rad/s, is that of a gyro with a similar error of scale.
-
-        rate: that of a gyro with the right scale. It differs from the other one.
-        """
-        size = abs(other - rate)
-        is_more = abs(other) > abs(rate)
-        share = self.share + ALIKE_SHARES
-        if self == UNKNOWN:
-            share = MOST_SHARE if is_more else MOST_ALIKE
-        elif not self.is_of_scale:
-            return False
-        most = share if is_more else min(share, MOST_ALIKE)
-        return size < most * abs(rate) + min_size
-
-
-WITHOUT_SCALE = Wrong(
-    rate=math.inf, share=1.0
-)  #: A dead axis, or one of which no more is known.
-#: An axis of which an older file tells only that it was bad: the turn that shows it shows any
-#: loss of scale that healthy gyros do not have.
-UNKNOWN = Wrong(rate=math.inf, share=SCALE)
 UNCOMPARED = Compared(*[UNKNOWN_RATES] * 4)
 
 
@@ -328,7 +261,7 @@ class Evidence:
     interval
         Time between two samples of an IMU, ns.
     min_size
-        Smallest difference at which an IMU is apart, rad/s. `SCALE` of the smaller of the
+        Smallest difference at which an IMU is apart, rad/s. `HEALTHY_SCALE` of the smaller of the
         two rates adds to it.
     """
 
@@ -523,7 +456,7 @@ class Evidence:
             if difference is not None:
                 self._known_at[j, k] = now
                 one, other = motions[j], motions[k]
-                scale = SCALE * min(one.largest, other.largest)
+                scale = HEALTHY_SCALE * min(one.largest, other.largest)
                 shifts = shift(one.gain, other.gain)
                 found = _compared(difference, quick, scale, shifts)
             elif now - self._known_at.get((j, k), 0) > BREAK:
@@ -735,7 +668,7 @@ class Evidence:
         not known yet.
         """
         rate, found = (self.raw.motion(k).mean[axis] for k in (unit, other))
-        least = self._min_size + SCALE * abs(nearest_zero((rate, found)))
+        least = self._min_size + HEALTHY_SCALE * abs(nearest_zero((rate, found)))
         differs = abs(found - rate) >= least
         return differs and (
             wrong is None or wrong.explains(rate, found, self._min_size)
@@ -874,7 +807,7 @@ class Evidence:
         """
         rates = (self.raw.motion(k).mean[axis] for k in (unit, other))
         # The share was measured without the part that scales explain.
-        error = (wrong.share + SCALE) * abs(nearest_zero(tuple(rates)))
+        error = (wrong.share + HEALTHY_SCALE) * abs(nearest_zero(tuple(rates)))
         return max(self._min_size, error / 2.0)
 
     def _voters(self, unit: int, units: Sequence[int]) -> list[int]:
@@ -982,7 +915,7 @@ class Evidence:
         axes = {axis for axis, size in enumerate(sizes) if size >= least}
         if not axes:
             return axes
-        limit = least + SCALE * max(self.raw.motion(k).largest for k in others)
+        limit = least + HEALTHY_SCALE * max(self.raw.motion(k).largest for k in others)
         return self._beyond_steps(axes, sizes, limit, others)
 
     def _beyond_steps(
