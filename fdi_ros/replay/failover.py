@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fdi_ros.mavlink.failover import OVERSAMPLING
-from fdi_ros.mavlink.failover_evidence import DOUBTS, SILENCE, Evidence
+from fdi_ros.mavlink.failover_evidence import SILENCE, Evidence
 from fdi_ros.mavlink.failover_policy import (
     PolicySettings,
     PolicyState,
@@ -23,6 +23,7 @@ from fdi_ros.mavlink.failover_policy import (
 )
 from fdi_ros.mavlink.failover_raw import LARGE_DIFFERENCE
 from fdi_ros.mavlink.failover_ready import INS_USE
+from fdi_ros.mavlink.failover_records import DOUBTS
 from fdi_ros.mavlink.failover_words import imu_name
 from fdi_ros.mavlink.protocol import NS
 from fdi_ros.model.samples import Block

@@ -1366,9 +1366,9 @@ def test_an_old_name_counts_on_an_axis_on_which_the_others_agree(
 
 def test_imus_are_trusted_after_two_seconds_of_agreement() -> None:
     watched = Watched(3, STEP, 1000.0).run(1.8)
-    assert not any(map(watched.evidence._is_trusted, range(3)))
+    assert not any(track.is_trusted for track in watched.evidence.tracks)
     watched.run(0.6)
-    assert all(map(watched.evidence._is_trusted, range(3)))
+    assert all(track.is_trusted for track in watched.evidence.tracks)
 
 
 @pytest.mark.parametrize(("rate", "trusted"), [(0.09, False), (0.11, True)])
@@ -1379,7 +1379,7 @@ def test_imus_are_trusted_once_they_have_turned_by_a_tenth_of_a_rad_per_second(
     watched = Watched(3, STEP, 1000.0)
     watched.rate = lambda t: np.array([rate, 0.0, 0.0])
     watched.run(3.0)
-    assert all(map(watched.evidence._is_trusted, range(3))) == trusted
+    assert all(track.is_trusted for track in watched.evidence.tracks) == trusted
 
 
 @pytest.mark.parametrize(("change", "moves"), [(0.004, set()), (0.006, {0})])
@@ -1391,9 +1391,9 @@ def test_an_axis_moves_whose_rate_changes_by_five_mrad_per_second(
     watched.random = SimpleNamespace(normal=lambda *_: np.zeros(3))
     watched.rate = lambda t: np.array([0.1 + change * (t > 2.0), 0.0, 0.0])
     watched.run(6.5)
-    assert watched.evidence._tracks[0].moves == moves
+    assert watched.evidence.tracks[0].moves == moves
     watched.run(2.0)
-    assert watched.evidence._tracks[0].moves == set()
+    assert watched.evidence.tracks[0].moves == set()
 
 
 def test_an_axis_counts_as_judged_for_a_second() -> None:
