@@ -13,18 +13,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fdi_ros.mavlink.failover import OVERSAMPLING
-from fdi_ros.mavlink.failover_evidence import SILENCE, Evidence
-from fdi_ros.mavlink.failover_policy import (
+from fdi_ros.mavlink.failover.controller import OVERSAMPLING
+from fdi_ros.mavlink.failover.evidence import SILENCE, Evidence
+from fdi_ros.mavlink.failover.policy import (
     PolicySettings,
     PolicyState,
     View,
     decide,
 )
-from fdi_ros.mavlink.failover_raw import LARGE_DIFFERENCE
-from fdi_ros.mavlink.failover_ready import INS_USE
-from fdi_ros.mavlink.failover_records import DOUBTS
-from fdi_ros.mavlink.failover_words import imu_name
+from fdi_ros.mavlink.failover.raw import LARGE_DIFFERENCE
+from fdi_ros.mavlink.failover.ready import INS_USE
+from fdi_ros.mavlink.failover.records import DOUBTS
+from fdi_ros.mavlink.failover.words import imu_name
 from fdi_ros.mavlink.protocol import NS
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.output import Output

@@ -35,9 +35,9 @@ from fdi_ros.core.messages import (
 )
 from fdi_ros.core.sources import ChannelsSource
 from fdi_ros.errors import ConfigError
-from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
-from fdi_ros.mavlink.failover_policy import PolicySettings
-from fdi_ros.mavlink.failover_ready import INS_USE
+from fdi_ros.mavlink.failover.controller import OVERSAMPLING, Failover
+from fdi_ros.mavlink.failover.policy import PolicySettings
+from fdi_ros.mavlink.failover.ready import INS_USE
 from fdi_ros.mavlink.link import open_link
 from fdi_ros.mavlink.protocol import ImuSample, Thinning, system_ahead
 from fdi_ros.mavlink.report import Announcer, Reporter, allows_arming

@@ -19,15 +19,15 @@ from typing import NoReturn, Protocol
 
 import numpy as np
 
-from fdi_ros.mavlink.failover import READ_EVERY, READ_HURRIED
-from fdi_ros.mavlink.failover_lane import (
+from fdi_ros.mavlink.failover.controller import READ_EVERY, READ_HURRIED
+from fdi_ros.mavlink.failover.lane import (
     ASK_AFTER,
     HEARTBEAT_AGE,
     LaneReport,
     LaneState,
     follow,
 )
-from fdi_ros.mavlink.failover_policy import (
+from fdi_ros.mavlink.failover.policy import (
     FRESH,
     GROUNDED,
     Imu,
@@ -37,7 +37,7 @@ from fdi_ros.mavlink.failover_policy import (
     View,
     decide,
 )
-from fdi_ros.mavlink.failover_words import Note, WordsState, announce
+from fdi_ros.mavlink.failover.words import Note, WordsState, announce
 
 MS = 1_000_000
 NS = 1000 * MS

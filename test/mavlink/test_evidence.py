@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.mavlink.failover_evidence import Evidence
-from fdi_ros.mavlink.failover_policy import Imu, PolicySettings, is_reserve
-from fdi_ros.mavlink.failover_raw import RawComparison, Rows
-from fdi_ros.mavlink.failover_wrong import UNKNOWN, WITHOUT_SCALE, Wrong
+from fdi_ros.mavlink.failover.evidence import Evidence
+from fdi_ros.mavlink.failover.policy import Imu, PolicySettings, is_reserve
+from fdi_ros.mavlink.failover.raw import RawComparison, Rows
+from fdi_ros.mavlink.failover.wrong import UNKNOWN, WITHOUT_SCALE, Wrong
 from mavlink.watched_flights import WatchedFlight
 
 MS = 1_000_000

@@ -24,10 +24,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fdi_ros.errors import ConfigError
 from fdi_ros.mavlink import kept_file
-from fdi_ros.mavlink.failover import OVERSAMPLING, Failover
-from fdi_ros.mavlink.failover_file import FailoverFile, Saved
-from fdi_ros.mavlink.failover_policy import PolicySettings
-from fdi_ros.mavlink.failover_words import Condition, imu_name, text_of
+from fdi_ros.mavlink.failover.controller import OVERSAMPLING, Failover
+from fdi_ros.mavlink.failover.file import FailoverFile, Saved
+from fdi_ros.mavlink.failover.policy import PolicySettings
+from fdi_ros.mavlink.failover.words import Condition, imu_name, text_of
 from fdi_ros.system.clocks import Clocks
 from mavlink.autopilots import (
     EKF_LANES,

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from fdi_ros.mavlink.failover_lane import LaneReport, LaneState, follow
-from fdi_ros.mavlink.failover_policy import Imu, Memory, PolicySettings, View
+from fdi_ros.mavlink.failover.lane import LaneReport, LaneState, follow
+from fdi_ros.mavlink.failover.policy import Imu, Memory, PolicySettings, View
 
 MS = 1_000_000
 NS = 1000 * MS

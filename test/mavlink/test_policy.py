@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from fdi_ros.mavlink.failover_policy import (
+from fdi_ros.mavlink.failover.policy import (
     Imu,
     Memory,
     PolicySettings,

@@ -6,7 +6,7 @@
 from collections.abc import Sequence
 from itertools import pairwise
 
-from fdi_ros.mavlink.failover_probe import Probe, probe
+from fdi_ros.mavlink.failover.probe import Probe, probe
 
 MS = 1_000_000
 NS = 1000 * MS

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from fdi_ros.mavlink.failover_policy import Imu, Memory, PolicySettings, View
-from fdi_ros.mavlink.failover_ready import Facts, not_ready
+from fdi_ros.mavlink.failover.policy import Imu, Memory, PolicySettings, View
+from fdi_ros.mavlink.failover.ready import Facts, not_ready
 
 NS = 1_000_000_000
 NOW = 100 * NS

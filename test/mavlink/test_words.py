@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from fdi_ros.mavlink.failover_policy import (
+from fdi_ros.mavlink.failover.policy import (
     GROUNDED,
     LONG_AGO,
     QUICK_TRIES,
@@ -17,8 +17,8 @@ from fdi_ros.mavlink.failover_policy import (
     PolicySettings,
     View,
 )
-from fdi_ros.mavlink.failover_ready import NO_OTHER
-from fdi_ros.mavlink.failover_words import (
+from fdi_ros.mavlink.failover.ready import NO_OTHER
+from fdi_ros.mavlink.failover.words import (
     VEHICLE,
     Condition,
     Note,

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from fdi_ros.config.config import Config
-from fdi_ros.mavlink.failover_evidence import Evidence
-from fdi_ros.mavlink.failover_policy import PolicySettings, PolicyState, View, decide
-from fdi_ros.mavlink.failover_ready import Facts, not_ready
+from fdi_ros.mavlink.failover.evidence import Evidence
+from fdi_ros.mavlink.failover.policy import PolicySettings, PolicyState, View, decide
+from fdi_ros.mavlink.failover.ready import Facts, not_ready
 from fdi_ros.model.samples import Block
 from fdi_ros.monitor.pipeline import Pipeline
 from mavlink.flights import fly_all

@@ -26,7 +26,7 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple
 
-from fdi_ros.mavlink.failover_policy import (
+from fdi_ros.mavlink.failover.policy import (
     GROUNDED,
     LONG_AGO,
     QUICK_TRIES,
@@ -38,7 +38,7 @@ from fdi_ros.mavlink.failover_policy import (
     is_apart,
     is_bad,
 )
-from fdi_ros.mavlink.failover_ready import INS_USE, MONITOR_LATE, NO_OTHER
+from fdi_ros.mavlink.failover.ready import INS_USE, MONITOR_LATE, NO_OTHER
 from fdi_ros.mavlink.protocol import MS, NS
 from fdi_ros.mavlink.report import CRITICAL, INFO, TEXT_LENGTH, WARNING
 
@@ -311,8 +311,8 @@ class Readiness(NamedTuple):
         Parameters
         ----------
         why
-            Reason against failover: `failover_ready.not_ready`, or, as an IMU that is out of
-            use is announced by itself, `failover_ready.not_again` while one is.
+            Reason against failover: `failover.ready.not_ready`, or, as an IMU that is out of
+            use is announced by itself, `failover.ready.not_again` while one is.
         is_out
             Whether one is.
         may_warn

@@ -7,11 +7,11 @@ docs/failover.md, "When an IMU is bad": an IMU is bad if it is off and accused o
 and if a or b holds.
 
 a. *Outvoted.* The two other IMUs agree on that axis, and both move on that axis. Both have trust,
-   and no doubt (`failover_outvoted`).
+   and no doubt (`failover.outvoted`).
 b. *Named for this difference.* The difference is twice ``failover_min_size``. The accusation came
    at most 0.3 s before the difference reached this size. The monitor does not doubt this axis of
    any IMU that counts there, and one of these moves on this axis. None may have failed like an
-   IMU that waits to agree in a turn about this axis (`failover_alike`).
+   IMU that waits to agree in a turn about this axis (`failover.alike`).
 
 The last IMU in use is bad if it is off and accused, without a or b.
 """
@@ -20,9 +20,9 @@ from __future__ import annotations
 
 from collections.abc import Set
 
-from fdi_ros.mavlink.failover_alike import others_fail_alike
-from fdi_ros.mavlink.failover_outvoted import outvoted_axes
-from fdi_ros.mavlink.failover_records import Present
+from fdi_ros.mavlink.failover.alike import others_fail_alike
+from fdi_ros.mavlink.failover.outvoted import outvoted_axes
+from fdi_ros.mavlink.failover.records import Present
 
 
 def bad_axes(present: Present, unit: int, accused: Set[int]) -> set[int]:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fdi_ros.mavlink.failover_wrong import UNKNOWN, Wrong
+from fdi_ros.mavlink.failover.wrong import UNKNOWN, Wrong
 from fdi_ros.mavlink.kept_file import KeptFile
 
 

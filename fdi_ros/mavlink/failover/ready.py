@@ -22,7 +22,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from fdi_ros.mavlink.failover_policy import (
+from fdi_ros.mavlink.failover.policy import (
     Memory,
     PolicySettings,
     View,

@@ -19,9 +19,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.mavlink.failover_policy import LONG_AGO
-from fdi_ros.mavlink.failover_raw import UNKNOWN_RATES, RawComparison
-from fdi_ros.mavlink.failover_wrong import Wrong
+from fdi_ros.mavlink.failover.policy import LONG_AGO
+from fdi_ros.mavlink.failover.raw import UNKNOWN_RATES, RawComparison
+from fdi_ros.mavlink.failover.wrong import Wrong
 from fdi_ros.mavlink.protocol import MS, Vector
 
 AXES = "xyz"
@@ -80,11 +80,12 @@ class Track:
     judged_at: list[int] = field(default_factory=lambda: [LONG_AGO] * 3)
     #: When each axis became FAULTY, or was last not accused.
     accused_at: list[int] = field(default_factory=lambda: [0] * 3)
+    #: Doubts of the monitor at the last look.
     last_doubts: set[ChannelState] = field(default_factory=set)
     doubts_since: int = 0  #: Since when the doubts are these.
 
     # The difference to the IMUs that count.
-    partners: Partners = NO_PARTNERS
+    partners: Partners = NO_PARTNERS  #: IMUs that count.
     nearest: Vector = UNKNOWN_RATES  #: Difference to the nearest partner, rad/s.
     bound: float = math.nan  #: A bound on that, rad/s.
     sizes: Vector = UNKNOWN_RATES  #: Largest difference of late, by axis, rad/s.
@@ -171,7 +172,7 @@ class Present(NamedTuple):
         int
     ]  #: IMUs that our orders took out in this flight, back in use or not.
     no_voters: Set[int]  #: IMUs of `taken` that are no voters.
-    raw: RawComparison
+    raw: RawComparison  #: Raw rates of all IMUs.
     #: How far each pair is apart.
     pairs: Mapping[Pair, Compared]
     #: The smallest steady difference of each pair within 50 ms, by axis, rad/s.

@@ -3,7 +3,7 @@
 
 """Failover of one ArduPilot: the policy joined to the vehicle, the monitor and the file.
 
-`Failover.turn` collects the present view, asks `fdi_ros.mavlink.failover_policy`, sends
+`Failover.turn` collects the present view, asks `fdi_ros.mavlink.failover.policy`, sends
 the orders and announces the conditions. All decisions are the policy's.
 """
 
@@ -13,10 +13,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from fdi_ros.mavlink.failover_evidence import SILENCE, Evidence
-from fdi_ros.mavlink.failover_file import FailoverFile, Saved
-from fdi_ros.mavlink.failover_lane import LaneReport, LaneState, follow
-from fdi_ros.mavlink.failover_policy import (
+from fdi_ros.mavlink.failover.evidence import SILENCE, Evidence
+from fdi_ros.mavlink.failover.file import FailoverFile, Saved
+from fdi_ros.mavlink.failover.lane import LaneReport, LaneState, follow
+from fdi_ros.mavlink.failover.policy import (
     Imu,
     PolicySettings,
     PolicyState,
@@ -24,9 +24,9 @@ from fdi_ros.mavlink.failover_policy import (
     decide,
     is_refused,
 )
-from fdi_ros.mavlink.failover_probe import Probe, probe
-from fdi_ros.mavlink.failover_raw import CURRENT
-from fdi_ros.mavlink.failover_ready import (
+from fdi_ros.mavlink.failover.probe import Probe, probe
+from fdi_ros.mavlink.failover.raw import CURRENT
+from fdi_ros.mavlink.failover.ready import (
     EKF_LANES,
     EKF_PRIMARY,
     INS_USE,
@@ -35,7 +35,7 @@ from fdi_ros.mavlink.failover_ready import (
     not_again,
     not_ready,
 )
-from fdi_ros.mavlink.failover_words import (
+from fdi_ros.mavlink.failover.words import (
     SIZING,
     Announced,
     Condition,

@@ -5,14 +5,14 @@
 
 docs/failover.md, "Words": an IMU is *off* on an axis if its raw rate differs there from that of
 every IMU that counts on this axis. The difference must reach ``failover_min_size`` plus 5 % of
-the rate, which `failover_apart` has taken off already.
+the rate, which `failover.apart` has taken off already.
 """
 
 from __future__ import annotations
 
 import math
 
-from fdi_ros.mavlink.failover_records import Present
+from fdi_ros.mavlink.failover.records import Present
 from fdi_ros.mavlink.protocol import NS
 
 #: Time constant with which the largest size of late decays, s: the size of an error that

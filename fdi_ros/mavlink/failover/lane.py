@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from fdi_ros.mavlink.failover_policy import (
+from fdi_ros.mavlink.failover.policy import (
     LONG_AGO,
     Imu,
     Memory,

@@ -7,7 +7,7 @@ docs/failover.md, "Which IMUs count on an axis":
 
 1. All IMUs in use count.
 2. An IMU out of use counts if it has trust on all axes.
-3. An IMU out of use also counts on an axis on which it has trust (`failover_trust`).
+3. An IMU out of use also counts on an axis on which it has trust (`failover.trust`).
 4. If every other IMU is out and none counts by rule 2, every other IMU counts.
 5. An IMU that is FAULTY is compared only with IMUs that the monitor does not doubt. If the
    monitor doubts all of them, the comparison is with all of them: two that are FAULTY may be so
@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.mavlink.failover_records import NO_PARTNERS, Partners, Present
+from fdi_ros.mavlink.failover.records import NO_PARTNERS, Partners, Present
 
 
 def partners(present: Present, unit: int) -> Partners:

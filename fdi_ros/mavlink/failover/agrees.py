@@ -6,7 +6,7 @@
 docs/failover.md, "Words": an IMU *agrees* with another IMU if the difference of the raw rates is
 below the limit of *off* on every axis. After a fault or a doubt, both must also agree in a turn.
 
-"When an IMU goes back": rule 3 has these turns (`failover_turns`), rule 4 the smaller limit of an
+"When an IMU goes back": rule 3 has these turns (`failover.turns`), rule 4 the smaller limit of an
 IMU that was bad, rule 5 what is asked of an IMU that the monitor doubts: the difference must
 scatter by less than 0.1 rad/s. "IMUs that fail alike" has agreement that proves nothing.
 """
@@ -14,11 +14,11 @@ scatter by less than 0.1 rad/s. "IMUs that fail alike" has agreement that proves
 from __future__ import annotations
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.mavlink.failover_alike import hides
-from fdi_ros.mavlink.failover_apart import BREAK_NS
-from fdi_ros.mavlink.failover_records import Present, Track
-from fdi_ros.mavlink.failover_turns import note_shown
-from fdi_ros.mavlink.failover_wrong import WITHOUT_SCALE
+from fdi_ros.mavlink.failover.alike import hides
+from fdi_ros.mavlink.failover.apart import BREAK_NS
+from fdi_ros.mavlink.failover.records import Present, Track
+from fdi_ros.mavlink.failover.turns import note_shown
+from fdi_ros.mavlink.failover.wrong import WITHOUT_SCALE
 
 
 def note_agreement(present: Present, unit: int) -> int | None:

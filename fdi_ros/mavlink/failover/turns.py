@@ -6,7 +6,7 @@
 docs/failover.md, "When an IMU goes back", rule 3: before the pause, the IMU has agreed in turns
 about every axis that was off or named. A turn of 0.06 rad/s or more shows a dead gyro. A scale
 error needs a faster turn (`Wrong.shown_by`). Agreement with an IMU that may have failed alike
-does not count (`failover_alike`).
+does not count (`failover.alike`).
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Set
 
-from fdi_ros.mavlink.failover_alike import is_witness
-from fdi_ros.mavlink.failover_apart import CALM
-from fdi_ros.mavlink.failover_off import off_axes
-from fdi_ros.mavlink.failover_records import Present
-from fdi_ros.mavlink.failover_trust import TURN_RATE
-from fdi_ros.mavlink.failover_wrong import WITHOUT_SCALE
+from fdi_ros.mavlink.failover.alike import is_witness
+from fdi_ros.mavlink.failover.apart import CALM
+from fdi_ros.mavlink.failover.off import off_axes
+from fdi_ros.mavlink.failover.records import Present
+from fdi_ros.mavlink.failover.trust import TURN_RATE
+from fdi_ros.mavlink.failover.wrong import WITHOUT_SCALE
 
 #: A turn shows an error in proportion to the rate if that error would be this multiple of
 #: ``min_size`` now. Of a dead gyro: 0.06 rad/s.

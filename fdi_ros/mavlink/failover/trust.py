@@ -17,8 +17,8 @@ import math
 from itertools import combinations
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.mavlink.failover_off import off_from_all
-from fdi_ros.mavlink.failover_records import Present
+from fdi_ros.mavlink.failover.off import off_from_all
+from fdi_ros.mavlink.failover.records import Present
 from fdi_ros.mavlink.protocol import MS, NS
 
 TRUSTED_AFTER_NS = 2 * NS  #: IMUs are trusted after all have agreed for this time, ns.

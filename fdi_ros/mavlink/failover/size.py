@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fdi_ros.mavlink.failover_policy import Imu
-from fdi_ros.mavlink.failover_raw import RawComparison
-from fdi_ros.mavlink.failover_records import AXES
+from fdi_ros.mavlink.failover.policy import Imu
+from fdi_ros.mavlink.failover.raw import RawComparison
+from fdi_ros.mavlink.failover.records import AXES
 from fdi_ros.mavlink.protocol import MS
 
 AVERAGED_NS = 80 * MS  #: The size is averaged over the samples of this time, ns.

@@ -9,20 +9,20 @@ comparison does neither and shows the present difference of the autopilot's own 
 `Evidence.look` lists the steps. Each rule of docs/failover.md has a module:
 
 =====================  ==================================================================
-`failover_records`     what is remembered of an IMU, and the present comparison of all
-`failover_apart`       how far two IMUs are apart
-`failover_off`         whether an IMU is off
-`failover_moves`       which axes move
-`failover_trust`       which IMUs have trust, on all axes or on some
-`failover_counts`      which IMUs count on an axis
-`failover_outvoted`    on which axes two IMUs outvote the third
-`failover_accused`     which IMU is accused by a set, or bad without an accusation
-`failover_bad`         when an IMU is bad: the rule that takes it out
-`failover_agrees`      since when an IMU agrees
-`failover_turns`       how an IMU is bad, and which turns show that it measures again
-`failover_alike`       IMUs that fail alike: agreement that proves nothing
-`failover_wrong`       how large the error of an axis was in proportion to the rate
-`failover_size`        the size of an error in a text
+`failover.records`     what is remembered of an IMU, and the present comparison of all
+`failover.apart`       how far two IMUs are apart
+`failover.off`         whether an IMU is off
+`failover.moves`       which axes move
+`failover.trust`       which IMUs have trust, on all axes or on some
+`failover.counts`      which IMUs count on an axis
+`failover.outvoted`    on which axes two IMUs outvote the third
+`failover.accused`     which IMU is accused by a set, or bad without an accusation
+`failover.bad`         when an IMU is bad: the rule that takes it out
+`failover.agrees`      since when an IMU agrees
+`failover.turns`       how an IMU is bad, and which turns show that it measures again
+`failover.alike`       IMUs that fail alike: agreement that proves nothing
+`failover.wrong`       how large the error of an axis was in proportion to the rate
+`failover.size`        the size of an error in a text
 =====================  ==================================================================
 """
 
@@ -31,29 +31,29 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence, Set
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.mavlink.failover_accused import Accusation, Standing, accusation
-from fdi_ros.mavlink.failover_agrees import note_agreement
-from fdi_ros.mavlink.failover_apart import PairMemory, steady_differences
-from fdi_ros.mavlink.failover_bad import bad_axes
-from fdi_ros.mavlink.failover_counts import partners
-from fdi_ros.mavlink.failover_moves import LastTurns, note_moves
-from fdi_ros.mavlink.failover_off import (
+from fdi_ros.mavlink.failover.accused import Accusation, Standing, accusation
+from fdi_ros.mavlink.failover.agrees import note_agreement
+from fdi_ros.mavlink.failover.apart import PairMemory, steady_differences
+from fdi_ros.mavlink.failover.bad import bad_axes
+from fdi_ros.mavlink.failover.counts import partners
+from fdi_ros.mavlink.failover.moves import LastTurns, note_moves
+from fdi_ros.mavlink.failover.off import (
     is_forgotten,
     least_difference,
     note_nearest,
     note_sizes,
 )
-from fdi_ros.mavlink.failover_policy import Imu
-from fdi_ros.mavlink.failover_raw import RawComparison
-from fdi_ros.mavlink.failover_records import AXES, Present, Track
-from fdi_ros.mavlink.failover_size import error_of
-from fdi_ros.mavlink.failover_trust import (
+from fdi_ros.mavlink.failover.policy import Imu
+from fdi_ros.mavlink.failover.raw import RawComparison
+from fdi_ros.mavlink.failover.records import AXES, Present, Track
+from fdi_ros.mavlink.failover.size import error_of
+from fdi_ros.mavlink.failover.trust import (
     agreement_of_all,
     note_proven,
     note_trust,
 )
-from fdi_ros.mavlink.failover_turns import note_wrong
-from fdi_ros.mavlink.failover_wrong import Wrong
+from fdi_ros.mavlink.failover.turns import note_wrong
+from fdi_ros.mavlink.failover.wrong import Wrong
 from fdi_ros.mavlink.protocol import NS
 
 SILENCE = NS // 2  #: An IMU without samples for this time does not deliver, ns.

@@ -24,10 +24,10 @@ from collections.abc import Sequence, Set
 from typing import NamedTuple
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.mavlink.failover_outvoted import outvoted_axes, voters
-from fdi_ros.mavlink.failover_raw import LARGE_DIFFERENCE, nearest_zero
-from fdi_ros.mavlink.failover_records import Present
-from fdi_ros.mavlink.failover_wrong import HEALTHY_SCALE
+from fdi_ros.mavlink.failover.outvoted import outvoted_axes, voters
+from fdi_ros.mavlink.failover.raw import LARGE_DIFFERENCE, nearest_zero
+from fdi_ros.mavlink.failover.records import Present
+from fdi_ros.mavlink.failover.wrong import HEALTHY_SCALE
 from fdi_ros.mavlink.protocol import MS, NS
 
 #: Difference from which the outvoted IMU needs no doubt of the monitor, rad/s. The monitor takes

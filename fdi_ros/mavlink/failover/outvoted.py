@@ -4,7 +4,7 @@
 """On which axes the two other IMUs outvote an IMU.
 
 docs/failover.md, "When an IMU is bad", rule a, *Outvoted*: the two other IMUs agree on that axis,
-and both move on that axis. Both have trust (`failover_trust`), and no doubt.
+and both move on that axis. Both have trust (`failover.trust`), and no doubt.
 
 *No doubt*: the monitor does not doubt the IMU. Some doubts do not count, see `vouched_axes`.
 
@@ -17,7 +17,7 @@ values of the two other IMUs must change, and these two must agree on all axes.
 
 from __future__ import annotations
 
-from fdi_ros.mavlink.failover_records import Present, Track
+from fdi_ros.mavlink.failover.records import Present, Track
 
 #: Two IMUs also agree within this share of their difference to the accused IMU.
 ALIKE = 0.05

@@ -42,7 +42,7 @@ MOST_LOST = 0.85
 #: Ratio of two steps in which `failover_file` keeps rate and share.
 STEP = 1.25
 #: A value that is a step already differs from it by less than this part of a step.
-ROUNDING = 1e-3
+STEP_ROUNDING = 1e-3
 
 
 class Wrong(NamedTuple):
@@ -74,8 +74,8 @@ class Wrong(NamedTuple):
             return self
         rate, share = (math.log(max(value, RESOLUTION), STEP) for value in self)
         if math.isfinite(rate):
-            rate = STEP ** math.ceil(rate - ROUNDING)
-        return Wrong(rate, STEP ** math.floor(share + ROUNDING))
+            rate = STEP ** math.ceil(rate - STEP_ROUNDING)
+        return Wrong(rate, STEP ** math.floor(share + STEP_ROUNDING))
 
     def shown_by(self, dead: float) -> float:
         """Return the least turn that shows this error, rad/s.

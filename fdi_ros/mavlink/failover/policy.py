@@ -5,8 +5,8 @@
 
 `decide` is a pure function, called at every tick (10 to 50 times a second), that takes
 the present view and its own memory, and returns orders and the next memory. It has no
-clock and no link. An order sets INS_USEk. `failover_words` has the texts for the pilot,
-`failover_ready` the conditions of "ready".
+clock and no link. An order sets INS_USEk. `failover.words` has the texts for the pilot,
+`failover.ready` the conditions of "ready".
 
 Definitions
     apart    on an axis: raw rate differs by ``min_size`` or more, and more than scales explain,
@@ -39,7 +39,7 @@ Definitions
              our order
     held     wanted out of use
 
-`failover_evidence.Evidence` finds which IMUs are apart, named and blamed.
+`failover.evidence.Evidence` finds which IMUs are apart, named and blamed.
 
 Rules, in this order at each tick
     1. A held IMU goes back in use if the operator asks; if every other IMU is dead or out

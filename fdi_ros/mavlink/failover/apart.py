@@ -8,7 +8,7 @@ rate. These are for the scales of healthy gyros, which differ by some per cent. 
 back", rule 4: delays of 5 ms are allowed for, too.
 
 "Vibration and the rate of the messages": a difference is an error only if it is steady
-(`failover_raw`). An oscillation is an error if its standard deviation is 1 rad/s or more.
+(`failover.raw`). An oscillation is an error if its standard deviation is 1 rad/s or more.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import math
 from collections.abc import Sequence
 from itertools import combinations
 
-from fdi_ros.mavlink.failover_raw import (
+from fdi_ros.mavlink.failover.raw import (
     LARGE_DIFFERENCE,
     Difference,
     RawComparison,
     shift,
 )
-from fdi_ros.mavlink.failover_records import UNCOMPARED, Compared, Pair
-from fdi_ros.mavlink.failover_wrong import HEALTHY_SCALE
+from fdi_ros.mavlink.failover.records import UNCOMPARED, Compared, Pair
+from fdi_ros.mavlink.failover.wrong import HEALTHY_SCALE
 from fdi_ros.mavlink.protocol import MS, Vector
 
 #: A shorter break of a lossy link ends no difference and no agreement, ns.

@@ -18,9 +18,9 @@ other, and the healthy third one differs from both.
 from __future__ import annotations
 
 from fdi_ros.core.states import ChannelState
-from fdi_ros.mavlink.failover_raw import nearest_zero
-from fdi_ros.mavlink.failover_records import Present
-from fdi_ros.mavlink.failover_wrong import ALIKE_SHARES, HEALTHY_SCALE, Wrong
+from fdi_ros.mavlink.failover.raw import nearest_zero
+from fdi_ros.mavlink.failover.records import Present
+from fdi_ros.mavlink.failover.wrong import ALIKE_SHARES, HEALTHY_SCALE, Wrong
 
 
 def is_witness(present: Present, unit: int, bad: int, axis: int) -> bool:

@@ -13,8 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from itertools import combinations
 
-from fdi_ros.mavlink.failover_raw import nearest_zero
-from fdi_ros.mavlink.failover_records import Present
+from fdi_ros.mavlink.failover.raw import nearest_zero
+from fdi_ros.mavlink.failover.records import Present
 from fdi_ros.mavlink.protocol import NS, Vector
 
 #: An axis moves if its mean rate, and the one of another IMU, change by this or more, rad/s. A
