@@ -14,7 +14,7 @@ that holds. `announce` compares it with the last one announced:
 4. At the start the last ones are `FINE` and `REDUNDANT`, so these two are announced only
    after another.
 5. Without a link nothing is announced, and what was announced into a gap of the link counts
-   as not announced (`failover.Failover`).
+   as not announced (`controller.Failover`).
 
 The text of `OUT` waits `SIZING` at most for the size of the error. `Readiness` announces
 whether failover itself works.
