@@ -107,7 +107,7 @@ def running(
         yield process
     finally:
         code = process.end()
-    assert code == 0, process.said()
+    assert code == 0, f"exit code {code}: {process.said()}"
     assert "Traceback" not in process.said()
 
 
