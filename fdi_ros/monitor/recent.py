@@ -125,6 +125,7 @@ class RecentHealth:
         noise = self._own_noise(status)
         measured = len(self._readings) >= _PAST.least_readings
         unit_of = {name: unit.name for unit in status.units for name in unit.channels}
+        scales = status.certain_scale_errors()
         for i, one in enumerate(status.channels):
             if one.is_left_out or one.state == ChannelState.AMBIGUOUS:
                 continue
@@ -149,7 +150,8 @@ class RecentHealth:
                 measured_in=one.unit,
                 repeated=float(stuck[i]) / max(1, int(finite[i])),
                 drift=status.drift_since_rest(one),
-                scale=status.certain_scale_error(one),
+                scale=scales[one.name].size,
+                scale_seen=scales[one.name].seen,
             )
 
     def _was_noisy(self, status: Status, channel: ChannelStatus) -> bool:

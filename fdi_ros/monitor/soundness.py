@@ -127,7 +127,9 @@ class ChannelHealth:
     drift: float = 0.0
     """Move of its bias since it was learned at rest, in `measured_in`. 0: not learned."""
     scale: float = 0.0
-    """Certain scale error against the other channels, a share. 0: none is certain."""
+    """Certain scale error against the mean of all channels along its axis, a share. 0: none is certain."""
+    scale_seen: float = 1.0
+    """Share of its scale error against the others that is in `scale`."""
     repeated: float = 0.0
     """Share of its values that repeated the value before for too long."""
     doubt: str = ""
@@ -533,9 +535,8 @@ def _wrong_scale(channels: Sequence[ChannelHealth]) -> list[Concern]:
         words = f"have scale factors that differ by {percent(high - low)}"
     else:
         verb = "reads" if len(odd) == 1 else "read"
-        words = (
-            f"{verb} at least {percent(most)} too {'much' if high > 0.0 else 'little'}"
-        )
+        most = max(abs(one.scale) / one.scale_seen for one in odd)
+        words = f"{verb} about {percent(most)} too {'much' if high > 0.0 else 'little'}"
     return _alike(odd, Word.LOOK, Trouble.SCALE, words)
 
 

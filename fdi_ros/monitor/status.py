@@ -41,6 +41,9 @@ CERTAIN_SIGMAS = 4.0
 """Standard deviations from which a measured delay, difference or trend is certain: by chance 1 in 16 000."""
 LOST_STATES = (ChannelState.FAULTY, ChannelState.STALE, ChannelState.EXCLUDED)
 SCALE_PARTS = ("scale x", "scale y", "scale z")  # kinds of `ErrorStatus`
+LEAST_SEEN = 0.6
+"""Smallest share of its scale error that the mean with the others leaves to a channel that is
+compared with others: it is 2/3 with three parallel channels, and 1/2 with two."""
 
 
 class ErrorLimits(NamedTuple):
@@ -210,6 +213,16 @@ class ErrorStatus:
 
 
 @dataclass(frozen=True)
+class ScaleError:
+    """How much more a channel reads than others."""
+
+    #: Against the mean of all channels along its axis, itself included, as a share. 0: none is certain.
+    size: float = 0.0
+    #: Share of the error against the others that is in ``size``.
+    seen: float = 1.0
+
+
+@dataclass(frozen=True)
 class Status:
     """State of the whole monitor after the last sample."""
 
@@ -288,26 +301,53 @@ class Status:
         """Return how far a bias moved since it was learned at rest, or 0 if it was not."""
         return channel.drift if self.bias_state.startswith("learned") else 0.0
 
-    def certain_scale_error(self, channel: ChannelStatus) -> float:
-        """Return how much more a channel reads than the rate or force along its axis, as a share.
+    def certain_scale_errors(
+        self, followed: Mapping[str, tuple[float, float]] | None = None
+    ) -> dict[str, ScaleError]:
+        """Return how much more each channel reads than the mean along its axis, by name.
 
-        0 unless it exceeds `UNUSUAL_ERRORS.scale` by `UNUSUAL_ERRORS.beyond` standard deviations.
+        It is 0 unless the error against the others exceeds `UNUSUAL_ERRORS.scale` by
+        `UNUSUAL_ERRORS.beyond` standard deviations.
+
+        Parameters
+        ----------
+        followed
+            Certain shares of the rate or force in the residuals of channels, beyond what the
+            estimator corrects, and their standard errors. None: not measured.
         """
-        parts = [
-            (error.value, error.std)
-            for error in self.errors
-            if error.owner == channel.name and error.kind in SCALE_PARTS
-        ]
-        if not parts:
-            return 0.0
-        value = sum(
-            a * value for a, (value, _) in zip(channel.axis, parts, strict=True)
-        )
-        std = math.hypot(
-            *(a * std for a, (_, std) in zip(channel.axis, parts, strict=True))
-        )
-        least = UNUSUAL_ERRORS.scale + UNUSUAL_ERRORS.beyond * std
-        return value if abs(value) > least else 0.0
+        followed = followed or {}
+        own: dict[str, list[tuple[float, float]]] = {}
+        for error in self.errors:
+            if error.kind in SCALE_PARTS:
+                own.setdefault(error.owner, []).append((error.value, error.std))
+        found = {one.name: ScaleError() for one in self.channels}
+        known = [one for one in self.channels if one.name in own]
+        for unit in dict.fromkeys(one.unit for one in known):
+            half = [one for one in known if one.unit == unit]
+            axes = np.array([one.axis for one in half])
+            parts = np.array([own[one.name] for one in half])
+            value = (axes * parts[:, :, 0]).sum(axis=1)
+            std = np.linalg.norm(axes * parts[:, :, 1], axis=1)
+            used = np.array([not one.is_left_out for one in half])
+            fit = (
+                axes[used] @ np.linalg.pinv(axes[used])
+                if used.any()
+                else np.zeros((0, 0))
+            )
+            left = np.eye(len(fit)) - fit
+            if followed and np.diag(left).min(initial=1.0) > 0.0:
+                more = np.array([followed.get(one.name, (0.0, 0.0)) for one in half])
+                value[used] = left @ (value + more[:, 0])[used]
+                std = np.where(more[:, 0] != 0.0, more[:, 1], std)
+            seen = np.ones(len(half))
+            seen[used] = np.diag(left)
+            # Of two, each may have the whole difference or none of it.
+            seen[seen < LEAST_SEEN] = 1.0
+            least = UNUSUAL_ERRORS.scale + UNUSUAL_ERRORS.beyond * std
+            certain = np.abs(value) / seen > least
+            for i in np.flatnonzero(certain).tolist():
+                found[half[i].name] = ScaleError(float(value[i]), float(seen[i]))
+        return found
 
     def turn_on_std(self, channel: ChannelStatus) -> float:
         """Return the standard deviation of a bias from one start to the next, in the channel's unit."""

@@ -8,6 +8,7 @@ All figures but the noise are measured on the recorded values, independent of th
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from fdi_ros.model.samples import Array, Int, flag_runs
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.recent import USUAL_QUANTILE
 from fdi_ros.monitor.soundness import UnitHealth, own_noise
+from fdi_ros.monitor.status import CERTAIN_SIGMAS
 
 
 class _Windows(NamedTuple):
@@ -66,6 +68,11 @@ NOISE_WINDOW = 3.0
 """Duration of a window in which noise is measured, s: some swings of a loose mount."""
 LEAST_USUAL_WINDOWS = 3
 """Smallest number of windows for a noise: fewer are dominated by the start-up."""
+
+LEAST_MOTION = 3.0
+"""Size of the rate over that of the residual, from which on a share of the rate can be seen in it."""
+LEAST_LEFT = 0.2
+"""Largest share of the variance of the residual that a scale error leaves, where it is its main part."""
 
 
 class Delivery(NamedTuple):
@@ -233,6 +240,19 @@ def with_context(unit: UnitHealth, context: FlightContext) -> UnitHealth:
     return replace(unit, origin=origin, temperature_c=temperature)
 
 
+class Usual(NamedTuple):
+    """What is usual for the errors of a channel."""
+
+    noise: float
+    """Standard deviation, without what follows the rate, rad/s. NaN: not measured."""
+    followed: float = 0.0
+    """Share of the rate along its axis that its errors contain. 0: none is certain."""
+    followed_std: float = 0.0
+    """Standard error of that share."""
+    is_scale_error: bool = False
+    """Whether its errors are mainly of that kind."""
+
+
 class UsualNoise:
     """Measures the noise of channels, block after block: the median of windows.
 
@@ -244,14 +264,19 @@ class UsualNoise:
         self._axes = axes
         self._noise: list[Array] = []
         """(n,) noise in each window, rad/s."""
+        self._moments: list[Array] = []
+        """(3, n) in each window: variance of the residual, of the rate along the axis, and their covariance."""
         self._window: list[Array] = []
         """(k, n) residuals of the present window, rad/s. NaN: the channel was not OK."""
+        self._rates: list[Array] = []
+        """(k, 3) rates of that window, rad/s."""
         self._begin: int | None = None
         """Stamp of its first sample, ns."""
 
     def add(self, output: Output) -> None:
         """Add the next samples."""
         residual = np.where(output.state == ChannelState.OK, output.residual, np.nan)
+        rate = output.rate
         stamp = output.stamp
         while len(stamp):
             if self._begin is None:
@@ -259,18 +284,63 @@ class UsualNoise:
             inside = stamp < self._begin + NOISE_WINDOW * 1e9
             count = len(stamp) if inside.all() else int(inside.argmin())
             self._window.append(residual[:count])
+            self._rates.append(rate[:count])
             residual = residual[count:]
+            rate = rate[count:]
             stamp = stamp[count:]
             if len(stamp):
-                self._noise.append(own_noise(np.concatenate(self._window), self._axes))
+                window = np.concatenate(self._window)
+                self._noise.append(own_noise(window, self._axes))
+                along = np.concatenate(self._rates) @ self._axes.T
+                self._moments.append(_moments(window, along))
                 self._window = []
+                self._rates = []
                 self._begin = None
 
-    def result(self) -> Array:
-        """Return the usual noise of each channel, (n,), rad/s. NaN: not measured."""
-        usual: Array = np.full(len(self._axes), np.nan)
-        if self._noise:
-            windows = np.array(self._noise)
-            measured = np.isfinite(windows).sum(axis=0) >= LEAST_USUAL_WINDOWS
-            usual[measured] = np.nanmedian(windows[:, measured], axis=0)
-        return usual
+    def result(self) -> list[Usual]:
+        """Return what is usual for each channel."""
+        if not self._noise:
+            return [Usual(math.nan) for _ in self._axes]
+        noise = np.array(self._noise)
+        moments = np.array(self._moments)
+        usual = [_usual(own, moments[:, :, i]) for i, own in enumerate(noise.T)]
+        if any(one.is_scale_error for one in usual):
+            return usual
+        # What the others follow is then of their noise in the rate, not of a scale factor.
+        return [Usual(one.noise) for one in usual]
+
+
+def _moments(residual: Array, along: Array) -> Array:
+    """Return variances of residuals (k, n) and of rates (k, n), and their covariances, (3, n).
+
+    They are of the samples with both, and 0 with fewer than two.
+    """
+    known = np.isfinite(residual) & np.isfinite(along)
+    count = np.maximum(known.sum(axis=0), 1)
+    pair = np.where(known, np.stack([residual, along]), 0.0)
+    pair = np.where(known, pair - pair.sum(axis=1, keepdims=True) / count, 0.0)
+    products = np.stack([pair[0] * pair[0], pair[1] * pair[1], pair[0] * pair[1]])
+    moments: Array = products.sum(axis=1) / count
+    return moments
+
+
+def _usual(noise: Array, moments: Array) -> Usual:
+    """Return what is usual for a channel with noise (k,) and moments (k, 3) in k windows."""
+    measured = np.isfinite(noise)
+    if measured.sum() < LEAST_USUAL_WINDOWS:
+        return Usual(math.nan)
+    usual = float(np.median(noise[measured]))
+    residual, rate, both = moments[measured].T
+    # Else noise that is in the rate, too, looks like a scale error.
+    if residual.sum() * LEAST_MOTION**2 >= rate.sum():
+        return Usual(usual)
+    followed = both.sum() / rate.sum()
+    # A swing of its own has the frequency of a rate for a time, but changes in size and sign.
+    std = np.linalg.norm(both - followed * rate) / rate.sum()
+    if abs(followed) < CERTAIN_SIGMAS * std:
+        return Usual(usual)
+    left = 1.0 - followed * both.sum() / residual.sum()
+    is_scale_error = bool(left <= LEAST_LEFT)
+    if is_scale_error:
+        usual *= math.sqrt(max(left, 0.0))
+    return Usual(usual, float(followed), float(std), is_scale_error)

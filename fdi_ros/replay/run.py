@@ -362,7 +362,14 @@ class Judge(Walk):
             unit for half in self.pipeline.halves for unit in half.geometry.unit_of
         ]
         residual_rms = evaluation.residual_rms
-        noise = self._usual_noise()
+        usual = [usual for one in self._noise for usual in one.result()]
+        names = [one.name for one in status.channels]
+        followed = {
+            name: (own.followed, own.followed_std)
+            for name, own in zip(names, usual, strict=True)
+            if own.followed
+        }
+        scales = status.certain_scale_errors(followed)
         for i, one in enumerate(status.channels):
             changes = [
                 change for change in evaluation.events if change.channel == one.name
@@ -392,7 +399,7 @@ class Judge(Walk):
                 noisy_s=noisy.seconds,
                 noisy_from_s=evaluation.time(noisy.since) if noisy.since else 0.0,
                 noisy_times=noisy.times,
-                own_noise_rad_s=noise[i],
+                own_noise_rad_s=finite(usual[i].noise),
                 residual_rms_rad_s=residual_rms[i],
                 doubt=_doubt_words(state, since, reason, end),
                 state=state,
@@ -400,7 +407,8 @@ class Judge(Walk):
                 reason=reason,
                 repeated=one.counts["stuck"] / max(1, one.finite),
                 drift=status.drift_since_rest(one),
-                scale=status.certain_scale_error(one),
+                scale=scales[one.name].size,
+                scale_seen=scales[one.name].seen,
                 noise=one.noise or None,
                 unchecked=1.0 - checked,
             )
@@ -414,10 +422,6 @@ class Judge(Walk):
             for spell in dict.fromkeys((one.longest_noisy, one.last_noisy))
             if spell.since
         ]
-
-    def _usual_noise(self) -> list[float | None]:
-        """Return the usual noise of each channel, rad/s. None: never OK."""
-        return [finite(noise) for one in self._noise for noise in one.result().tolist()]
 
     def _units(self, status: Status) -> Iterator[UnitHealth]:
         """Yield the health of each unit, or of the one topic with all channels."""

@@ -267,7 +267,7 @@ def test_what_nothing_checks_gives_a_rate_and_is_not_called_healthy(
         (2, 0.04, set()),
         (2, 0.12, {"imu_1.y", "imu_2.y"}),
         (3, 0.04, set()),
-        (3, -0.12, {"imu_2.y"}),
+        (3, -0.12, {"imu_1.y", "imu_2.y", "imu_3.y"}),
     ],
 )
 def test_a_scale_error_that_was_learned_is_told(units, share, wrong):
@@ -278,12 +278,12 @@ def test_a_scale_error_that_was_learned_is_told(units, share, wrong):
     block.z[:, 4] *= 1.0 + share
     assert not [event for event in pipeline.process(block).events if event.declares]
     status = pipeline.status()
-    found = {c.name: status.certain_scale_error(c) for c in status.channels}
-    assert {name for name, size in found.items() if size} == wrong
+    found = status.certain_scale_errors()
+    assert {name for name, one in found.items() if one.size} == wrong
     if wrong:
         # Half of the difference of two, and two thirds of that of one to two others.
         expected = share * (units - 1) / units
-        assert found["imu_2.y"] == pytest.approx(expected, rel=0.15)
+        assert found["imu_2.y"].size == pytest.approx(expected, rel=0.15)
     assert all(str(error) for error in status.errors)
 
 
