@@ -19,6 +19,7 @@ from fdi_ros.core.sources import SOURCES
 from fdi_ros.errors import BagError
 from fdi_ros.inspection.degrees import in_degrees
 from fdi_ros.inspection.findings import Finding, Role
+from fdi_ros.inspection.gravity import in_gravity
 from fdi_ros.inspection.topics import (
     BELIEVED,
     TopicReport,
@@ -206,6 +207,11 @@ def refuse_unfit(bag: Path, config: Config) -> list[TopicReport]:
     chosen = [one for one in inspect(bag, config.topics).reports if one.channels]
     if words := in_degrees(chosen, max(LARGEST_GYRO_RANGE, *config.health.max_rate)):
         raise BagError(f"{bag} needs {words}; mend the driver")
+    is_judged = config.accelerometers.enabled != "off"
+    if is_judged and (words := in_gravity(chosen)):
+        raise BagError(
+            f"{bag} needs {words}; mend the driver, or set accelerometers.enabled to off"
+        )
     if words := one_clock(chosen, config.imus.timeout):
         raise BagError(f"{bag} needs one clock: {words}")
     return chosen
@@ -272,7 +278,7 @@ def needs(reports: Sequence[TopicReport]) -> str:
     Empty if a config can be made.
     """
     if chosen := candidates(reports):
-        return in_degrees(chosen) or _in_bursts(chosen)
+        return in_degrees(chosen) or in_gravity(chosen) or _in_bursts(chosen)
     why = [
         (shown(report.topic.name), _unusable(report))
         for report in reports

@@ -10,6 +10,7 @@ import pytest
 from bag.recordings import START, imu, write_mcap
 
 from fdi_ros.inspection.degrees import in_degrees
+from fdi_ros.inspection.gravity import in_gravity
 from fdi_ros.inspection.segments import NoiseSegments
 from fdi_ros.inspection.tilt import sum_of, swings_of
 from fdi_ros.inspection.topics import inspect
@@ -151,3 +152,36 @@ def test_the_factor_is_that_of_the_unit_of_the_rates(factor):
     still = sum_of(swings_of(*halves(random, rate, np.tile(GRAVITY, (3000, 1)), 0, 0)))
     assert (still.factor, still.shared) == (0.0, 0.0)
     assert swings_of(gyros, NoiseSegments(3)) == []
+
+
+@pytest.mark.parametrize(
+    ("units", "words"),
+    [
+        ((1 / 9.81,) * 3, "/imu_0, /imu_1 and /imu_2 are in g, they usually show"),
+        ((1.0, 1000 / 9.81, 1.0), "/imu_1 are in mg, they usually show"),
+        ((1.0, 1.0, 1.0), ""),
+        # Without gravity, as some drivers send it: 1 m/s^2 is no unit.
+        ((0.0, 0.0, 0.0), ""),
+    ],
+)
+def test_accelerometers_in_units_of_gravity_are_refused(units, words, tmp_path, fdi):
+    random = np.random.default_rng(4)
+    messages = []
+    motion = swings(random, 8, 0.6)
+    for k, unit in enumerate(units):
+        force = unit * GRAVITY + (unit or 1.0) * motion
+        force = force + random.normal(0.0, 0.003, force.shape)
+        for i, (rate, one) in enumerate(zip(0.3 * motion, force, strict=True)):
+            at = START + i * 10**9 // RATE + 1000 * k
+            values = rate + random.normal(0.0, 0.001, 3)
+            messages.append((f"/imu_{k}", at, imu(at, values, force=tuple(one))))
+    messages.sort(key=lambda one: one[1])
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    found = in_gravity(inspect(path).reports)
+    assert words in found
+    assert bool(found) == bool(words)
+    if words:
+        assert fdi("inspect", path).out.startswith(
+            f"NEEDS m/s^2: the accelerometers of {words}"
+        )
+        assert words in fdi("replay", path).err
