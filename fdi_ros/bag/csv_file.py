@@ -29,14 +29,22 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Protocol
 
 import numpy as np
 
 from fdi_ros.bag.flight_context import FlightContext
-from fdi_ros.bag.flight_log import FlightLog, ImuSamples, Portion, Source, imu_samples
+from fdi_ros.bag.flight_log import (
+    SETTINGS,
+    FlightLog,
+    ImuSamples,
+    Portion,
+    Source,
+    Track,
+    imu_samples,
+)
 from fdi_ros.bag.raw import MOST_SHOWN, Damage
 from fdi_ros.errors import BagError
 from fdi_ros.model.quantity import STANDARD_GRAVITY
@@ -104,6 +112,8 @@ class Note(Protocol):
 class Columns(NamedTuple):
     """Which columns of a table are read."""
 
+    #: names of all columns
+    names: tuple[str, ...]
     #: index of the column
     time: int
     #: seconds of one unit of time, 0 if the first time decides
@@ -136,6 +146,8 @@ class CsvLog(FlightLog):
     slowest = 5.0
     #: number of its only IMU, None for the numbers in the names of the columns
     number: int | None = None
+    #: name of the column of times, and a time that is no number, empty for none
+    _untimed: tuple[str, str] = ("", "")
 
     def find_context(self) -> FlightContext:
         """Return the names of the IMUs in the table, where these are not numbers."""
@@ -159,6 +171,22 @@ class CsvLog(FlightLog):
             self.leave_out(names, why)
         else:
             self.state(line)
+
+    def _refusal(self, sensors: Mapping[Source, Track]) -> str:
+        """Describe why the lines of the table hold no samples."""
+        lines = self.counts["lines"]
+        if any(track.count for track in sensors.values()):
+            return super()._refusal(sensors)
+        if not lines:
+            return " has names of columns, and no line of numbers below them"
+        name, cell = self._untimed
+        if name:
+            what = f"{shown(cell, 32)!r} in its column {shown(name, 32)!r}"
+            return (
+                f" has no line whose time is a number: it has {what}. What to do: write times in s, or"
+                f" in another unit that the name states, such as time_ms ({SETTINGS})"
+            )
+        return f" has {lines} lines of numbers, and no times that increase. What to do: {self.settings} ({SETTINGS})"
 
     def portions(self) -> Iterator[Portion]:
         """Read the table from its start up to `end`."""
@@ -191,6 +219,10 @@ class CsvLog(FlightLog):
             )
             good = np.isfinite(table[:, 0])
             bad += int((~good).sum())
+            if not good.all() and not self._untimed[0]:
+                line = lines[used[int(np.argmin(good))]].decode("utf-8", "replace")
+                cells = [*line.split(delimiter), *[""] * len(columns.names)]
+                self._untimed = columns.names[columns.time], cells[columns.time].strip()
             # Numbers of a damaged table may be anything.
             with np.errstate(all="ignore"):
                 if not columns.tick and good.any():
@@ -329,6 +361,7 @@ def _columns(
     if number is not None or max(numbers, default=MOST_IMUS) >= MOST_IMUS:
         numbers = list(range(first, first + len(choice.imus)))
     columns = Columns(
+        tuple(names),
         names.index(choice.time),
         _factor(time_unit, _TIME_UNITS, 0.0, choice.time),
         tuple(numbers),

@@ -31,7 +31,7 @@ from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.noise import much_noisier, noisier_words
 from fdi_ros.model.samples import LARGEST_GYRO_RANGE
 from fdi_ros.monitor.inputs import is_of_a_monitor
-from fdi_ros.monitor.soundness import REPORTED, Trouble
+from fdi_ros.monitor.soundness import REPORTED, Trouble, trouble_of_unused
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.system.text import LINE, figures, first_of, listed, percent, shown
 
@@ -325,7 +325,7 @@ def recording_findings(
             headline="NEEDS A LOOK",
         )
     for topic, words in unused_topics(reports, unread):
-        yield _look("left out", words, Trouble.LEFT_OUT, (topic,))
+        yield _look("left out", words, trouble_of_unused(words), (topic,))
     yield from message_findings(chosen)
     yield from bad_values(chosen)
     units = len(chosen) > 1

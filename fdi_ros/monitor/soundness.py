@@ -193,7 +193,9 @@ class Trouble(Enum):
         "judge only the part before the values repeat (--end), or check the driver if the vehicle moved"
         " meanwhile; at rest, coarse values repeat by themselves"
     )
-    LEFT_OUT = "to judge {who} too, list the units to judge in a config (--config), or mend the cause"
+    LEFT_OUT = "to judge {who} too, mend the cause"
+    TOO_MANY = "to judge {who} too, list the units to judge in a config (--config)"
+    STEPS_BACK = "judge {who} as a file of its own, and let the logger begin a new file after a restart"
     DELIVERY = "check connection, driver and bus load of {who}"
     STAMPS = (
         "check the driver of {who}: every message needs the time of its measurement"
@@ -219,9 +221,27 @@ class Trouble(Enum):
 
     def advice(self, who: Iterable[str]) -> str:
         """Return what to do. ``who``: channels, units or topics, none if the advice names none."""
-        units = dict.fromkeys(name.rpartition(".")[0] or name for name in who)
+        # A name with a space is of a part of a file, and ends with the name of the file.
+        units = dict.fromkeys(
+            name if " " in name else name.rpartition(".")[0] or name for name in who
+        )
         names = [shown(name, LINE) for name in units]
         return self.value.format(who=listed(names) if names else "")
+
+
+def trouble_of_unused(why: str) -> Trouble:
+    """Return the kind of a concern about something that is left out for a reason in words."""
+    for words, trouble in _TROUBLE_OF_UNUSED.items():
+        if words in why:
+            return trouble
+    return Trouble.LEFT_OUT
+
+
+_TROUBLE_OF_UNUSED = {
+    "a config has at most": Trouble.TOO_MANY,
+    "the time steps back": Trouble.STEPS_BACK,
+}
+"""Kind of a concern by words of the reason. Other reasons lie in the messages themselves."""
 
 
 class Concern(NamedTuple):
@@ -344,7 +364,7 @@ def concerns_of(
     by_unit = {unit.name for unit in units if _is_slow(unit)}
     alone = [one for one in channels if one.unit not in by_unit]
     left_out = [
-        Concern(Word.LOOK, Trouble.LEFT_OUT, (topic,), f"is left out: {why}")
+        Concern(Word.LOOK, trouble_of_unused(why), (topic,), f"is left out: {why}")
         for topic, why in unused
     ]
     return [

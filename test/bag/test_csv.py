@@ -293,6 +293,25 @@ def test_columns_of_one_name_are_refused_and_those_of_another_unit_are_left_out(
     )
 
 
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ((), "has names of columns, and no line of numbers below them"),
+        (
+            ("2026-05-04T10:00:00.02,1,2,3,4,5,6",) * 3,
+            "has no line whose time is a number: it has '2026-05-04T10:00:00.02' in its column"
+            " 'time'. What to do: write times in s",
+        ),
+    ],
+)
+def test_a_table_without_samples_says_what_it_lacks(lines, words, tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(
+        "\n".join([",".join(["time", *named("gyro_{k}_{axis}")[1:]]), *lines, ""])
+    )
+    assert words in refusal(path)
+
+
 def test_a_table_in_utf_16_is_refused(tmp_path):
     path = write(tmp_path, named("gyro_{k}_{axis}"))
     path.write_text(path.read_text(), encoding="utf-16")

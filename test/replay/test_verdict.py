@@ -576,6 +576,20 @@ def test_concerns_name_what_is_wrong_and_nothing_else():
     assert str(concerns_of([never])[0]) == "b.x could not be checked"
 
 
+def test_the_advice_on_what_is_left_out_helps_against_its_reason():
+    reasons = [
+        ("/imu_4", "a config has at most 4 units"),
+        ("the last 45 % of a.csv", "the time steps back before it"),
+        ("/imu_2", "no message in which all values are finite and below 1000000 rad/s"),
+    ]
+    assert [one.advice for one in concerns_of([], unused=reasons)] == [
+        "to judge /imu_4 too, list the units to judge in a config (--config)",
+        "judge the last 45 % of a.csv as a file of its own, and let the logger begin a new file"
+        " after a restart",
+        "to judge /imu_2 too, mend the cause",
+    ]
+
+
 @pytest.mark.parametrize(
     ("scales", "said"),
     [
