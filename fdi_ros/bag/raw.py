@@ -227,7 +227,11 @@ class BagFile(ABC):
         elif begin.startswith(self.magic):
             return
         else:
-            refusal = f"{self.refusal}: it starts with {begin[: len(self.magic)]!r}"
+            head = begin[: len(self.magic)]
+            text = " ".join(head.decode("utf-8", "replace").split())
+            is_text = head.isascii() and text.isprintable()
+            what = f"the text {text!r}" if is_text else f"the bytes {head.hex(' ')}"
+            refusal = f"{self.refusal}: it starts with {what}"
         self.file.close()
         raise BagError(f"{path} {refusal}")
 

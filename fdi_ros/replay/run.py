@@ -41,7 +41,7 @@ from fdi_ros.monitor.soundness import (
     UnitHealth,
     checked_share,
 )
-from fdi_ros.monitor.status import Status
+from fdi_ros.monitor.status import UNUSUAL_ERRORS, Status
 from fdi_ros.replay.episodes import EPISODE_TIMES, Story, join_halves, pieces
 from fdi_ros.replay.health import (
     Deliveries,
@@ -58,6 +58,7 @@ from fdi_ros.replay.summary import (
     BiasResult,
     ChannelResult,
     DelayResult,
+    FarBias,
     Judgement,
     MonitorResult,
     ProtectionLevel,
@@ -274,7 +275,12 @@ class Judge(Walk):
         delays = zip(status.units, status.delays, status.delay_std, strict=False)
         levels = (status.protection_level, status.protection_level_after_loss)
         far = [
-            one.name
+            FarBias(
+                one.name,
+                abs(one.start_bias),
+                UNUSUAL_ERRORS.start_bias * status.turn_on_std(one),
+                one.unit,
+            )
             for one in status.channels
             if status.has_implausible_start_bias(one)
         ]
@@ -286,7 +292,12 @@ class Judge(Walk):
                 DelayResult(unit.name, late, std) for unit, late, std in delays
             ),
             degraded=tuple(self._degraded.values()),
-            bias=BiasResult(status.bias_state, tuple(status.bias), tuple(far)),
+            bias=BiasResult(
+                status.bias_state,
+                tuple(status.bias),
+                tuple(one.channel for one in far),
+                tuple(far),
+            ),
             note=status.note,
             protection_level=ProtectionLevel(
                 *(tuple(map(finite, level)) for level in levels)

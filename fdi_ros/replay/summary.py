@@ -62,6 +62,20 @@ class DelayResult:
 
 
 @dataclass(frozen=True)
+class FarBias:
+    """A bias at the start that no healthy sensor is expected to have."""
+
+    channel: str
+    """Name of the channel."""
+    size: float
+    """Size of the bias, in `unit`."""
+    limit: float
+    """Largest size that is expected, four ``turn_on_std``, in `unit`."""
+    unit: str
+    """rad/s of a gyro, m/s^2 of an accelerometer."""
+
+
+@dataclass(frozen=True)
 class BiasResult:
     """Biases at the end."""
 
@@ -72,6 +86,8 @@ class BiasResult:
     far: tuple[str, ...] = ()
     """Channels that began with more than four ``bias.turn_on_std``, which is learned, as a
     fault from before the start would be."""
+    far_biases: tuple[FarBias, ...] = ()
+    """Their biases."""
 
 
 @dataclass(frozen=True)

@@ -126,9 +126,16 @@ def unjudged_words(judgement: Judgement) -> str:
     if share < LEAST_JUDGED:
         return f"only {percent(share)} of {scores.samples} samples were judged"
     if bias.far:
+        # The largest one stands for all: they may be many.
+        worst = max(bias.far_biases, key=lambda one: one.size / one.limit)
+        began = f"{listed(bias.far)} began with"
+        if len(bias.far) > 1:
+            began += f" biases of up to {figures(worst.size, 2)} {worst.unit}"
+        else:
+            began += f" a bias of {figures(worst.size, 2)} {worst.unit}"
         return (
-            f"the bias of {listed(bias.far)} is far larger than turn_on_std allows: perhaps a"
-            " fault from before the recording"
+            f"{began}, and {figures(worst.limit, 2)} {worst.unit} is the most for a healthy sensor:"
+            " perhaps a fault from before the recording"
         )
     return ""
 
@@ -137,7 +144,7 @@ def _to_judge(judgement: Judgement) -> str:
     """Return what to do about a recording that was not judged as a whole."""
     bias = judgement.monitor.bias
     if bias.far:
-        return f"check {listed(bias.far)}, or set turn_on_std if such a bias is usual"
+        return f"check {listed(bias.far)}, or raise turn_on_std in a config if such a bias is usual"
     if bias.state == "learning":
         return "record for longer, with some seconds of rest at the start"
     frozen = [
@@ -290,7 +297,7 @@ def _advice(judgement: Judgement, faulty: Sequence[Episode]) -> str:
     if others:
         all_of_them = dict.fromkeys(name for units in others for name in units)
         steps.append(
-            f"{listed(list(all_of_them))} are compared at rest and in turns: one is faulty"
+            f"{listed(list(all_of_them))} are compared at rest and in turns: at least one is faulty"
         )
     return f"Do not fly before {', and '.join(steps)}."
 

@@ -621,8 +621,17 @@ def test_instances_without_end_are_no_instances(tmp_path):
     ("name", "content", "words"),
     [
         ("a.bin", b"", "is empty"),
-        ("a.bin", b"ULog\x01\x12\x35", "is no log of ArduPilot: it starts with b'UL'"),
-        ("a.ulg", b"\xa3\x95\x80" * 9, "is no log of PX4"),
+        (
+            "a.bin",
+            b"ULog\x01\x12\x35",
+            "is no log of ArduPilot: it starts with the text 'UL'",
+        ),
+        ("a.ulg", b"a\nb c d e", "is no log of PX4: it starts with the text 'a b c d'"),
+        (
+            "a.ulg",
+            b"\xa3\x95\x80" * 9,
+            "is no log of PX4: it starts with the bytes a3 95 80 ",
+        ),
         ("a.ulg", logs.ULOG_HEAD + bytes(4), "Header too short"),
         (
             "a.bin",

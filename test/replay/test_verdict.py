@@ -34,7 +34,8 @@ from fdi_ros.monitor.soundness import (
 )
 from fdi_ros.replay.health import WINDOWS, Deliveries
 from fdi_ros.replay.run import Judge, replay
-from fdi_ros.replay.verdict import _other_names, _without_brief_sets
+from fdi_ros.replay.summary import BiasResult, FarBias
+from fdi_ros.replay.verdict import _other_names, _without_brief_sets, unjudged_words
 from fdi_ros.replay.words import sentences
 
 CASES = ROOT.parent / "shared" / "data" / "cases"
@@ -588,6 +589,23 @@ def test_the_advice_on_what_is_left_out_helps_against_its_reason():
         " after a restart",
         "to judge /imu_2 too, mend the cause",
     ]
+
+
+def test_a_bias_beyond_any_healthy_one_is_said_with_its_size_and_the_limit():
+    far = [FarBias("a.y", 0.1103, 0.08, "rad/s"), FarBias("b.x", 0.0912, 0.08, "rad/s")]
+
+    def words(*some):
+        names = tuple(one.channel for one in some)
+        scores = SimpleNamespace(samples=9, samples_judged=9)
+        bias = BiasResult("learned", (), names, some)
+        return unjudged_words(
+            SimpleNamespace(scores=scores, monitor=SimpleNamespace(bias=bias))
+        )
+
+    assert words(far[0]).startswith(
+        "a.y began with a bias of 0.11 rad/s, and 0.08 rad/s is the most for a healthy sensor"
+    )
+    assert "a.y and b.x began with biases of up to 0.11 rad/s" in words(*far)
 
 
 @pytest.mark.parametrize(
