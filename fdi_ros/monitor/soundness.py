@@ -180,6 +180,8 @@ class RateHealth:
     """Start of the first time without it, s. None: not known, or no such time."""
     share: float = 1.0
     """Share of the samples with a fused rate."""
+    frozen: tuple[str, ...] = ()
+    """All units, if each repeated one value when the rate was missing first. Empty: another cause."""
 
 
 class Trouble(Enum):
@@ -440,7 +442,11 @@ def _rate_concerns(rate: RateHealth | None) -> list[Concern]:
     since = rate.missing_from_s
     when = "" if since is None else f", for the first time at {since:.1f} s"
     words = f"was not published for {figures(rate.missing_s)} s{when}"
-    return [Concern(word, Trouble.NO_RATE, ("the fused rate",), words)]
+    who = ("the fused rate",)
+    if rate.frozen:
+        words += f", when {listed(rate.frozen)} repeated one value"
+        return [Concern(word, Trouble.REPEATS, who, words, cause=rate.frozen)]
+    return [Concern(word, Trouble.NO_RATE, who, words)]
 
 
 def _is_slow(unit: UnitHealth) -> bool:

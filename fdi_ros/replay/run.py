@@ -28,9 +28,11 @@ from fdi_ros.bag.samples import Samples
 from fdi_ros.compiling.notice import clock
 from fdi_ros.config.config import Config
 from fdi_ros.core.sources import source_of
+from fdi_ros.core.states import Reason
 from fdi_ros.faults.fault import Fault, Injector, fault_from, parse_fault
 from fdi_ros.inspection.starting_config import assumed_config, starting_config_of
 from fdi_ros.inspection.values import Values
+from fdi_ros.model.quantity import RATE
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.diagnostics import degraded
 from fdi_ros.monitor.output import Output
@@ -75,6 +77,9 @@ ConfigSource = Config | Source | None
 """Settings, or a parameter file. None: the settings that ``fdi inspect`` writes."""
 PORTION = 16384
 """Largest number of samples that are judged at once, which bounds the memory for their outputs."""
+
+TOGETHER_S = 1.0
+"""Time within which units begin to repeat one value at the same time, s."""
 
 
 class Sink:
@@ -323,10 +328,11 @@ class Judge(Walk):
             ]
             injected = tuple(f"{fault.kind.name} on {fault.channel}" for fault in known)
             episodes.append(replace(one, injected=injected))
+        rate = replace(monitor.rate, frozen=_frozen_when(monitor, story))
         return Judgement(
             status.detector,
             evaluation.scores(),
-            monitor,
+            replace(monitor, rate=rate),
             replace(story, episodes=tuple(episodes)),
         )
 
@@ -473,6 +479,24 @@ class Judge(Walk):
         step, count = np.array(sorted(self._intervals)).T
         middle = np.searchsorted(np.cumsum(count), count.sum() / 2)
         return float(1e9 / step[middle])
+
+
+def _frozen_when(monitor: MonitorResult, story: Story) -> tuple[str, ...]:
+    """Return all units, if each repeated one value when the fused rate was missing first."""
+    since = monitor.rate.missing_from_s
+    if since is None:
+        return ()
+    frozen = {
+        name
+        for one in story.episodes
+        if one.evidence.reason == Reason.FROZEN.value
+        and abs(one.start_s - since) < TOGETHER_S
+        for name in one.channels
+    }
+    gyros = [one for one in monitor.channels if one.measured_in == RATE.unit]
+    if not frozen.issuperset(one.name for one in gyros):
+        return ()
+    return tuple(dict.fromkeys(one.unit or one.name for one in gyros))
 
 
 def _joined(

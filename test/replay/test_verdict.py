@@ -5,6 +5,7 @@
 
 import json
 import re
+from dataclasses import replace as changed
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,6 +18,7 @@ from monitor.streams import RATE, body_rate, parallel, stream, swing
 
 from fdi_ros.config.config import Config
 from fdi_ros.config.unit_names import short_names, unit_names
+from fdi_ros.core.states import Reason
 from fdi_ros.faults.fault import Injector, parse_fault
 from fdi_ros.inspection.values import Values
 from fdi_ros.model.geometry import Geometry
@@ -33,7 +35,7 @@ from fdi_ros.monitor.soundness import (
     word_of,
 )
 from fdi_ros.replay.health import WINDOWS, Deliveries
-from fdi_ros.replay.run import Judge, replay
+from fdi_ros.replay.run import Judge, _frozen_when, replay
 from fdi_ros.replay.summary import BiasResult, FarBias
 from fdi_ros.replay.verdict import _other_names, _without_brief_sets, unjudged_words
 from fdi_ros.replay.words import sentences
@@ -575,6 +577,28 @@ def test_concerns_name_what_is_wrong_and_nothing_else():
     ]
     never = ChannelHealth(name="b.x", checked=0.0)
     assert str(concerns_of([never])[0]) == "b.x could not be checked"
+
+
+def test_a_rate_that_is_missing_says_that_all_units_repeated_one_value():
+    channels = [ChannelHealth(name=name, unit=name[:5]) for name in UNITS]
+    rate = RateHealth(missing_s=3.9, missing_from_s=8.1)
+    monitor = SimpleNamespace(channels=channels, rate=rate)
+    evidence = SimpleNamespace(reason=Reason.FROZEN.value)
+    episodes = [
+        SimpleNamespace(
+            channels=tuple(UNITS[k : k + 3]), start_s=8.1, evidence=evidence
+        )
+        for k in (0, 3, 6)
+    ]
+    units = _frozen_when(monitor, SimpleNamespace(episodes=episodes))
+    assert units == ("imu_0", "imu_1", "imu_2")
+    assert _frozen_when(monitor, SimpleNamespace(episodes=episodes[1:])) == ()
+    (missing,) = concerns_of([], rate=changed(rate, frozen=units))
+    assert missing.words.endswith("when imu_0, imu_1 and imu_2 repeated one value")
+    assert missing.advice.startswith("check the driver of imu_0, imu_1 and imu_2 if")
+    # One that goes on measuring is another cause.
+    (missing,) = concerns_of([], rate=rate)
+    assert missing.advice.startswith("see in the report")
 
 
 def test_the_advice_on_what_is_left_out_helps_against_its_reason():
