@@ -95,7 +95,8 @@ class Size:
     share_of_rate: float | None = None
     """Scale error, as a share of the rate. None: another course than ``proportional``."""
     gone_s: float | None = None
-    """Time at which the error ended, s from the first message. None: another course than ``gone``."""
+    """Time at which the error ended, s from the first message. None: it did not, or the
+    course is neither ``gone`` nor ``proportional``."""
 
 
 @dataclass(frozen=True)
@@ -196,6 +197,8 @@ class Episode:
     """The fused rate during the episode."""
     words: str = ""
     """The episode in one sentence."""
+    wrong_to_s: float | None = None
+    """Time of the last wrong value, s. The monitor withdraws a declaration later. None: not known."""
     measured_in: str = RADIANS.name
     """Unit of sizes and standard deviations: rad/s, or m/s^2 for accelerometers."""
     injected: tuple[str, ...] = ()
@@ -392,11 +395,14 @@ def size_words(size: Size | None, unit: Unit = RADIANS) -> str:
     if size.course == "proportional":
         share = size.share_of_rate or 0.0
         of = true_quantity(unit)
+        until = "" if size.gone_s is None else f", until {size.gone_s:.3f} s"
         if shows_nothing(share):
-            return f"does not follow the {of}, off by {figure} rms"
+            return f"does not follow the {of}, off by {figure} rms{until}"
         if is_factor(share):
-            return f"{figures(1.0 + share, 2)} times the {of}, off by {figure} rms"
-        return f"{figures(100.0 * share, 2, '+')} % of the {of}, {figure} rms"
+            return (
+                f"{figures(1.0 + share, 2)} times the {of}, off by {figure} rms{until}"
+            )
+        return f"{figures(100.0 * share, 2, '+')} % of the {of}, {figure} rms{until}"
     if size.course == "noisy":
         return f"noise of {figure}"
     if size.course == "varying":

@@ -636,11 +636,9 @@ class Batches:
         self._scale = scale
         self._bias = bias
         self._width = _BATCHES.first
-        # Number of samples, sum, sum of squares of each batch.
-        self._sums = np.zeros((3, _BATCHES.batches))
-        self._with_rate = np.zeros(
-            2
-        )  # sum of error times rate, and of the squared rate
+        # Of each batch: number of samples, sum, sum of squares, sum of error times rate, and sum of
+        # squares of the rate.
+        self._sums = np.zeros((5, _BATCHES.batches))
 
     def add(self, time: Array, error: Array, rate: Array) -> None:
         """Add finite samples (N,): time, s, error and rate along the axis, rad/s."""
@@ -653,21 +651,20 @@ class Batches:
         while time[-1] - self._begin >= _BATCHES.batches * self._width:
             self._sums = np.hstack(
                 [
-                    self._sums.reshape(3, -1, 2).sum(axis=2),
-                    np.zeros((3, _BATCHES.batches // 2)),
+                    self._sums.reshape(5, -1, 2).sum(axis=2),
+                    np.zeros((5, _BATCHES.batches // 2)),
                 ]
             )
             self._width *= 2
-        passed = (time - self._begin) / self._width
-        number = np.maximum(passed.astype(np.intp), 0)
+        number = np.maximum(((time - self._begin) / self._width).astype(np.intp), 0)
         number = np.minimum(number, _BATCHES.batches - 1)
-        for k, values in enumerate((None, error, error**2)):
+        for k, values in enumerate((None, error, error**2, error * rate, rate**2)):
             self._sums[k] += np.bincount(number, values, _BATCHES.batches)
-        self._with_rate += float(error @ rate), float(rate @ rate)
 
     def size(self, declared: float) -> Size | None:
         """Return size and course. ``declared``: time of the declaration, s. None: no sample."""
-        count, total, square = self._sums
+        count, total, square, _, squared_rate = self._sums
+        rates = float(squared_rate.sum())
         used = np.flatnonzero(count)
         if not len(used):
             return None
@@ -680,23 +677,12 @@ class Batches:
         mean_square = float(square.sum() / samples)
         scatter = mean_square - whole**2
         scatter = scatter if scatter > _COURSES.rounding * mean_square else 0.0
-        lasting = math.hypot(
-            self._scale * math.sqrt(float(self._with_rate[1]) / samples), self._bias
-        )
+        lasting = math.hypot(self._scale * math.sqrt(rates / samples), self._bias)
         std = math.hypot(_standard_error(mean, scatter, samples), lasting)
         last = float(mean[-1])
-        rms, (product, rates) = math.sqrt(mean_square), self._with_rate.tolist()
-        # Share of the mean square that a regression on the rate explains.
-        explained = (
-            product**2 / (rates * samples * mean_square)
-            if rates > 0.0 and mean_square > 0.0
-            else 0.0
-        )
-        if explained > 0.5 and explained > 2 * whole**2 / mean_square:
-            chance = _standard_error(mean, scatter, samples)
-            return Size(
-                rms, chance, "proportional", last, share_of_rate=product / rates
-            )
+        rms = math.sqrt(mean_square)
+        if found := self._proportional(used, mean, last):
+            return found
         at = (middle >= declared) & (
             middle < declared + max(_COURSES.time, self._width)
         )
@@ -723,6 +709,64 @@ class Batches:
             if scatter > (_COURSES.loud * self._noise) ** 2:
                 return Size(rms, rms / math.sqrt(2.0 * samples), "noisy", last)
         return Size(whole, std, "steady", last)
+
+    def _proportional(
+        self, used: NDArray[np.intp], mean: Array, last: float
+    ) -> Size | None:
+        """Return the size of an error that a regression on the rate explains. None: it does not.
+
+        Such an error may end before the last sample.
+        """
+        count, total, square, products, squared_rate = self._sums[:, used]
+        loud = np.flatnonzero(square > (_COURSES.loud * self._noise) ** 2 * count)
+        for end in dict.fromkeys((len(used), int(loud[-1]) + 1 if len(loud) else 0)):
+            part = slice(end)
+            samples = float(count[part].sum())
+            rates = float(squared_rate[part].sum())
+            power = float(square[part].sum())
+            product = float(products[part].sum())
+            if rates <= 0.0 or power <= 0.0:
+                continue
+            constant = float(total[part].sum()) ** 2 / samples
+            explained = product**2 / rates
+            if explained <= 0.5 * power or explained <= 2.0 * constant:
+                continue
+            share = product / rates
+            gone = self._share_gone(used, share)
+            if gone is not None:
+                during = used[: np.searchsorted(used, gone)]
+                _, _, _, products_then, rates_then = self._sums[:, during]
+                share = float(products_then.sum() / rates_then.sum())
+                samples = float(self._sums[0, during].sum())
+                power = float(self._sums[2, during].sum())
+            elif end < len(used):
+                continue
+            rms = math.sqrt(power / samples)
+            scatter = max(power - constant, 0.0) / samples
+            chance = _standard_error(mean[:end], scatter, samples)
+            until = None
+            if gone is not None:
+                until = round(self._begin + gone * self._width, 3)
+            return Size(
+                rms, chance, "proportional", last, share_of_rate=share, gone_s=until
+            )
+        return None
+
+    def _share_gone(self, used: NDArray[np.intp], share: float) -> int | None:
+        """Return the number of the batch from which on the error is no such share of the rate.
+
+        None: it is not over. At a small rate the error shows in no batch.
+        """
+        count, _, square, _, squared_rate = self._sums[:, used]
+        expected = abs(share) * np.sqrt(squared_rate / count)
+        shows = expected > _COURSES.loud * self._noise
+        large = np.flatnonzero(shows & (np.sqrt(square / count) >= 0.5 * expected))
+        if not len(large):
+            return None
+        after = shows[large[-1] + 1 :].sum() * self._width
+        if after < max(_COURSES.time, 2 * self._width):
+            return None
+        return int(used[large[-1]]) + 1
 
     def _gone(self, used: NDArray[np.intp], mean: Array, then: float) -> float | None:
         """Return the time, s, since which the error is below `_COURSES.passed`. None: it is not over."""

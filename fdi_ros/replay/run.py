@@ -78,6 +78,11 @@ ConfigSource = Config | Source | None
 PORTION = 16384
 """Largest number of samples that are judged at once, which bounds the memory for their outputs."""
 
+BY_VALUES = tuple(
+    reason.value
+    for reason in (Reason.NON_FINITE, Reason.STUCK, Reason.FROZEN, Reason.OLD)
+)
+"""Reasons that each wrong value shows. Such a declaration ends ``clean_time`` after the last of them."""
 TOGETHER_S = 1.0
 """Time within which units begin to repeat one value at the same time, s."""
 
@@ -327,7 +332,11 @@ class Judge(Walk):
                 if followed.explains(one.start_s, one.ever)
             ]
             injected = tuple(f"{fault.kind.name} on {fault.channel}" for fault in known)
-            episodes.append(replace(one, injected=injected))
+            wrong_to = None
+            if one.declares and not one.stands and one.evidence.reason in BY_VALUES:
+                clean_time = self.pipeline.config.decision.clean_time
+                wrong_to = round(max(one.end_s - clean_time, one.since_s), 9)
+            episodes.append(replace(one, injected=injected, wrong_to_s=wrong_to))
         rate = replace(monitor.rate, frozen=_frozen_when(monitor, story))
         return Judgement(
             status.detector,

@@ -361,6 +361,8 @@ def _who(one: Episode) -> str:
     """Return the channels as spoken: ``imu_0, x and y,``."""
     if one.halves:
         return one.who
+    if one.evidence.reason == Reason.OLD.value and len(one.channels) > 1:
+        return f"{one.channels[0].rpartition('.')[0]}, all axes,"
     parts = [name.rpartition(".") for name in one.channels]
     units = {unit for unit, _, _ in parts}
     is_loose = one.sets > 1 or one.noisy_from_s is not None
@@ -393,7 +395,8 @@ def _when(one: Episode) -> str:
     lasted = one.end_s - one.since_s
     if not one.stands:
         brief = f", for {1000 * lasted:.0f} ms" if lasted < EPISODE_TIMES.brief else ""
-        since += brief or f" to {one.end_s:.1f} s"
+        end = one.end_s if one.wrong_to_s is None else one.wrong_to_s
+        since += brief or f" to {end:.1f} s"
     if one.state == "STALE":
         return f"gives no data {since}"
     return since
@@ -442,10 +445,7 @@ def _size_words(size: Size, unit: Unit) -> str:
     """Describe an error, as it continues ``It``. Empty: too small to measure."""
     value = _size(size, unit)
     if size.course == "proportional":
-        share = size.share_of_rate or 0.0
-        if shows_nothing(share):
-            return f"does not follow the true {true_quantity(unit)}"
-        return f"reads {_share_words(share, unit)}"
+        return _proportional_words(size, unit)
     if size.course == "noisy":
         return f"has noise of {value} {unit.name}"
     if size.course == "varying":
@@ -464,6 +464,19 @@ def _size_words(size: Size, unit: Unit) -> str:
     return f"is off by {value} {unit.name}"
 
 
+def _proportional_words(size: Size, unit: Unit) -> str:
+    """Describe an error that is a share of the rate, as it continues ``It``."""
+    share = size.share_of_rate or 0.0
+    of = true_quantity(unit)
+    if size.gone_s is None and shows_nothing(share):
+        return f"does not follow the true {of}"
+    if size.gone_s is None:
+        return f"reads {_share_words(share, unit)}"
+    if shows_nothing(share):
+        return f"did not follow the true {of} until {size.gone_s:.1f} s"
+    return f"read {_share_words(share, unit)} until {size.gone_s:.1f} s"
+
+
 def _share_words(share: float, unit: Unit) -> str:
     """Describe a scale error: ``5 % too much``, or ``8.0 times the true rate``."""
     if is_factor(share):
@@ -478,6 +491,8 @@ def _reason_sentences(one: Episode) -> list[str]:
         return [f"It came and went {sets} times, as the error of a loose unit does."]
     reason = one.evidence.reason
     common = (Reason.DISAGREES.value, Reason.DRIFTED.value, Reason.NO_DATA.value)
+    if reason == Reason.OLD.value:
+        return [f"Reason: {reason}."]
     if one.state != "FAULTY" or not reason or reason.startswith(common):
         return []
     return [f"Reason: {reason}."]

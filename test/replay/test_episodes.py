@@ -411,6 +411,27 @@ def test_the_standard_error_holds_for_errors_that_hang_together():
     assert inside / count == pytest.approx(0.93, abs=0.05)
 
 
+@pytest.mark.parametrize("share", [-1.0, 0.3])
+@pytest.mark.parametrize("until", [None, 8.0])
+def test_a_share_of_the_rate_that_ends_is_not_mixed_with_what_follows(share, until):
+    noise = np.random.default_rng(0).normal(0.0, 0.01, len(TIME))
+    wrong = (until or TIME[-1]) >= TIME
+    rate = np.sin(3.0 * TIME)
+    batches = Batches(0.0, 0.01)
+    batches.add(TIME, noise + share * rate * wrong, rate)
+    found = batches.size(0.0)
+    assert found.course == "proportional"
+    assert found.share_of_rate == pytest.approx(share, abs=0.02)
+    assert (found.gone_s is None) == (until is None)
+    if until is not None:
+        assert found.gone_s == pytest.approx(until, abs=0.3)
+    # At rest at the end it may go on.
+    batches = Batches(0.0, 0.01)
+    batches.add(TIME, noise + share * rate * wrong, np.where(wrong, rate, 0.0))
+    found = batches.size(0.0)
+    assert found.course != "proportional" or found.gone_s is None
+
+
 # Which declaration is whose doing -------------------------------------------------------------------------------------
 
 

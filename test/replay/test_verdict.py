@@ -37,7 +37,12 @@ from fdi_ros.monitor.soundness import (
 from fdi_ros.replay.health import WINDOWS, Deliveries
 from fdi_ros.replay.run import Judge, _frozen_when, replay
 from fdi_ros.replay.summary import BiasResult, FarBias
-from fdi_ros.replay.verdict import _other_names, _without_brief_sets, unjudged_words
+from fdi_ros.replay.verdict import (
+    _other_names,
+    _without_brief_sets,
+    unjudged_words,
+    verdict_of,
+)
 from fdi_ros.replay.words import sentences
 
 CASES = ROOT.parent / "shared" / "data" / "cases"
@@ -577,6 +582,23 @@ def test_concerns_name_what_is_wrong_and_nothing_else():
     ]
     never = ChannelHealth(name="b.x", checked=0.0)
     assert str(concerns_of([never])[0]) == "b.x could not be checked"
+
+
+def test_a_fault_ends_with_its_last_wrong_value():
+    """The monitor uses the channel again only some seconds later."""
+    settings = {"detector__name": "sequential", "decision__latch": False}
+    pipeline = Pipeline(parallel(3, **settings))
+    block = stream(pipeline.geometry, 1800)
+    block.z[800:1000, 4] = np.nan
+    judge = Judge(pipeline, Injector((), pipeline.channel_names))
+    judge.injector.start_stamp = int(block.stamp[0])
+    judge.take(block)
+    found = judge.judgement()
+    (one,) = found.story.declared
+    assert one.end_s > 12.0
+    assert one.wrong_to_s == pytest.approx(10.0, abs=0.1)
+    words = "FAULTY: imu_2.y from 8.1 s to 10.0 s. Reason: not a finite number."
+    assert words in verdict_of(found).sentence
 
 
 def test_a_rate_that_is_missing_says_that_all_units_repeated_one_value():
