@@ -40,6 +40,8 @@ class _Windows(NamedTuple):
     slow: float = 0.6
     #: windows in a row that a unit is slow at least
     least_slow: int = 3
+    #: messages that a window has more by jitter of their times at its edges
+    edge: float = 1.5
 
 
 WINDOWS = _Windows()
@@ -175,11 +177,13 @@ class Deliveries:
             return [Delivery(1.0, None) for _ in counts]
         steady_rates = [self._steady_rate(k) for k in range(len(counts))]
         steady: Array = np.array(steady_rates)
-        most = np.quantile(counts, USUAL_QUANTILE, axis=1)
-        usual: Array = np.maximum(np.maximum(most, width * steady), 1.0)
+        highest = np.quantile(counts, USUAL_QUANTILE, axis=1)
+        # Arrival times that jitter about the edge of a window move a message to the next one.
+        highest = np.where(highest - width * steady <= WINDOWS.edge, 0.0, highest)
+        usual: Array = np.maximum(np.maximum(highest, width * steady), 1.0)
         shares = counts / usual[:, None]
         # Messages that the recorder lost are missing on all topics.
-        recorded = shares.max(axis=0)
+        recorded = np.minimum(shares.max(axis=0), 1.0)
         shares = shares[:, recorded > 0] / np.maximum(recorded[recorded > 0], 1e-9)
         times: Array = np.asarray(self._start + width * np.flatnonzero(recorded > 0))
         # The quantile is a little more than the mean of the windows of a usual rate.
@@ -188,8 +192,10 @@ class Deliveries:
         rates = (counts * full).sum(axis=1) / windows / width
         rates = np.maximum(rates, steady)
         return [
-            _delivery(np.asarray(np.minimum(own, 1.0)), times, width, rate)
-            for own, rate in zip(shares, rates.tolist(), strict=True)
+            _delivery(np.minimum(own, 1.0 + WINDOWS.edge / most), times, width, rate)
+            for own, most, rate in zip(
+                shares, usual.tolist(), rates.tolist(), strict=True
+            )
         ]
 
 
@@ -207,7 +213,8 @@ def _delivery(shares: Array, times: Array, width: float, rate: float) -> Deliver
     times = times[begun:]
     if not len(shares):
         return Delivery(1.0, None)
-    share = float(shares.mean())
+    # What a window lacks by the jitter at its edges, the next one has.
+    share = min(float(shares.mean()), 1.0)
     runs = flag_runs(shares < WINDOWS.slow).tolist()
     first, last = max(runs, key=lambda run: run[1] - run[0], default=[0, 0])
     if last - first < WINDOWS.least_slow:

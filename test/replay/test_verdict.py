@@ -507,6 +507,18 @@ def test_a_topic_whose_messages_come_only_at_the_end_delivered_nothing():
     assert late.share == 0.0
 
 
+@given(st.sampled_from([20.0, 50.0, 200.0]), st.integers(0, 99), st.floats(0.75, 1.0))
+def test_times_of_arrival_about_the_edges_of_windows_lose_no_message(rate, seed, part):
+    """The windows begin with the first message, and so do those of a rate in whole Hz."""
+    random = np.random.default_rng(seed)
+    steady = np.arange(0.0, 40.0, 1 / rate) + 0.001
+    times = [steady + np.abs(random.normal(0.0, 3e-4, len(steady))) for _ in range(3)]
+    times.append(times[0][random.uniform(size=len(steady)) < part])
+    *whole, some = tapped(times, 4)
+    assert min(one.share for one in whole) > 0.99
+    assert some.share == pytest.approx(part, abs=0.05)
+
+
 @given(st.floats(10.0, 400.0), st.floats(0.0, 0.45), st.integers(20, 50))
 def test_a_unit_that_slows_down_is_seen_and_the_others_are_not(rate, left, after):
     steady = np.arange(0.0, 90.0, 1 / rate)
