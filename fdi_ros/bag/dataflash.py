@@ -272,9 +272,7 @@ class DataflashLog(FlightLog):
             if final or not size:
                 break
         if lost + self.end - offset:
-            self.note(
-                f"{lost + self.end - offset} bytes belong to no whole record and were left out"
-            )
+            self.leave_bytes(lost + self.end - offset)
 
     def _read(
         self, data: Bytes, begin: int, final: bool

@@ -49,6 +49,7 @@ from fdi_ros.system.files import MCAP, RECORDING
 
 # As whole numbers, which compiled code compares with bytes.
 FOOTER = int(Opcode.FOOTER)
+_LAST_OPCODE = int(Opcode.DATA_END)
 SCHEMA = int(Opcode.SCHEMA)
 CHANNEL = int(Opcode.CHANNEL)
 MESSAGE = int(Opcode.MESSAGE)
@@ -383,17 +384,19 @@ class McapFile(BagFile):
             if opcode == FOOTER:
                 # Damaged bytes may look like a footer, so any rest behind one is noted.
                 if end + len(self.magic) != self.size:
-                    self.note(
+                    self.lose(
                         f"it has a footer at byte {position} of {self.size}: read up to there"
                     )
                 return
             if left < 0:
-                self.note(
+                self.lose(
                     f"it has more records than its size explains: read up to byte {position}"
                 )
                 return
             if end > self.size:
-                self.note(
+                # Behind damaged bytes in place of a record, there may be others.
+                is_record = opcode <= _LAST_OPCODE
+                (self.break_off if is_record else self.lose)(
                     f"it breaks off in the record at byte {position} of {self.size}: read up to there"
                 )
             start = position + _RECORD.size
@@ -410,7 +413,9 @@ class McapFile(BagFile):
             if end > self.size:
                 return
             position = end
-        self.note("it has no footer: the recording was cut off, all there is was read")
+        self.break_off(
+            "it has no footer: the recording was cut off, all there is was read"
+        )
 
     def _scan_chunk(self, offset: int, end: int) -> None:
         head = self._read(offset, _CHUNK.size + 16)
@@ -433,7 +438,7 @@ class McapFile(BagFile):
                     )
                 )
                 return
-        self.note(f"the chunk at byte {offset} has a damaged header and was left out")
+        self.lose(f"the chunk at byte {offset} has a damaged header and was left out")
 
     def _scan_run(self, position: int, end: int) -> int:
         """Note the run of messages outside chunks that begins here, and return its end."""
@@ -463,7 +468,8 @@ class McapFile(BagFile):
         )
         found, topics, end = walk(data)
         if wrong or end < len(data):
-            self.note(
+            note = self.break_off if piece.cut else self.lose
+            note(
                 f"the chunk at byte {piece.offset} {wrong or f'is damaged after byte {end} of {len(data)}'}"
             )
         for opcode, content in topics:

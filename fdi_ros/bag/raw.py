@@ -129,6 +129,10 @@ def unpack_message(data: bytes, most: int) -> bytes:
     return unpacked
 
 
+MUCH_LOST = 0.01
+"""Share of a flight log that is more than records cut off at its end."""
+
+
 @dataclass
 class Damage:
     """Unreadable parts of a recording, one line per place, and facts beside them."""
@@ -143,6 +147,13 @@ class Damage:
     #: gyros that cannot be read as such, and why
     left_out: list[tuple[str, str]] = field(default_factory=list)
 
+    #: whether messages of the recording are missing
+    lost: bool = False
+    #: whether a file ends before the recorder closed it, as where the power goes
+    cut_off: bool = False
+    #: whether the recorder wrote the metadata, which it does last: then no file ends early
+    closed: bool = False
+
     #: lines kept, while further ones are only counted
     MOST = 20
 
@@ -155,6 +166,11 @@ class Damage:
             self.lines.append(line)
         else:
             self.more += 1
+
+    def lose(self, line: str) -> None:
+        """Note a place where messages are missing."""
+        self.lost = True
+        self.add(line)
 
     def __bool__(self) -> bool:
         return bool(self.lines)
@@ -243,6 +259,24 @@ class BagFile(ABC):
         """Note damage."""
         self._damage.add(f"{self.path.name}: {line}")
 
+    def lose(self, line: str) -> None:
+        """Note damage in which messages are missing."""
+        self._damage.lose(f"{self.path.name}: {line}")
+
+    def break_off(self, line: str) -> None:
+        """Note that the file ends before it was closed, or was cut off later."""
+        if self._damage.closed:
+            self._damage.lost = True
+        else:
+            self._damage.cut_off = True
+        self.note(line)
+
+    def leave_bytes(self, count: int) -> None:
+        """Note bytes that belong to no record. The last record of a log is seldom whole."""
+        much = count > MUCH_LOST * self.size
+        note = self.lose if much else self.note
+        note(f"{count} bytes belong to no whole record and were left out")
+
     def state(self, fact: str) -> None:
         """Note a fact that readers must know."""
         self._damage.state(f"{self.path.name}: {fact}")
@@ -306,11 +340,12 @@ def find_files(path: Path, damage: Damage) -> tuple[Path, ...]:
     if tables := tables_of(path):
         return tables[: RECORDING.files]
     about = _metadata(path, damage)
+    damage.closed = bool(about)
     # One that is named twice is read once.
     names = dict.fromkeys(str(name) for name in about.get("relative_file_paths") or [])
     there = [name for name in names if os.path.isfile(path / name)]
     for name in names.keys() - set(there):
-        damage.add(f"{Path(name).name} is named in metadata.yaml and not there")
+        damage.lose(f"{Path(name).name} is named in metadata.yaml and not there")
     # metadata.yaml is written last. Without it, numbers in the names give the order.
     paths = [path / name for name in there]
     if not paths:

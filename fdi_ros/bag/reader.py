@@ -292,7 +292,7 @@ class Recording:
             kind = FORMATS.get(plain.suffix.lower(), SqliteFile)
             self._files.append(kind(plain, self.damage, self._left))
         except BagError as error:
-            self.damage.add(str(error))
+            self.damage.lose(str(error))
             return error
         return None
 
@@ -316,7 +316,7 @@ class Recording:
         except (OSError, zstandard.ZstdError) as error:
             if not plain.exists() or plain.stat().st_size == 0:
                 raise BagError(f"{path} cannot be unpacked: {error}") from error
-            self.damage.add(
+            self.damage.lose(
                 f"{path.name} cannot be unpacked to its end ({error}): read as far as it goes"
             )
         self._left = max(0, self._left - plain.stat().st_size)

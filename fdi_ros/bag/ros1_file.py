@@ -114,7 +114,7 @@ class Ros1File(LibraryBag):
                 message = converted_from_ros1(data, connection.msgtype)
                 yield connection.id, time, message
         except _ROS1_ERRORS as error:
-            self.note(f"it is damaged ({error}): read up to there")
+            self.lose(f"it is damaged ({error}): read up to there")
 
     def _take_in_order_of_writing(self, numbers: Sequence[int]) -> None:
         """Order the messages of topics by their places if the clock of the recorder was set back."""

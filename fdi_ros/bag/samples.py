@@ -33,6 +33,8 @@ _MOST_AT_ONCE = 16384
 _MOST_WAITING = 1 << 20
 WRONG_RATE = 0.2
 """Relative error of a configured sample rate at which thresholds and times are wrong."""
+_NOT_SECONDS = 900.0
+"""Factor between rates from which on a unit of time is wrong, not a setting: ms or us for ns."""
 _RATE_SAMPLES, _FEWEST_STEPS = 5000, 50
 """Samples that determine the rate of a recording, and the fewest intervals for that."""
 #: decoded messages, by field
@@ -121,9 +123,16 @@ class Samples:
         """Stamp of the last message of each topic, ns. -1: none."""
         self._set_back = np.zeros(len(self.topics), dtype=np.int64)
         """Longest step back of the stamps of each topic, ns."""
+        self.steps_back = [StepBack() for _ in self.topics]
+        """Whether the clock of each topic was set back."""
         self.progress = 0.0  #: share of the recording read so far
         self.newest = [Newest() for _ in self.topics]
         """Last message of each topic so far, if blocks are cut by period."""
+
+    @property
+    def reads_to_end(self) -> bool:
+        """Whether the part that is read lasts to the end of the recording."""
+        return math.isinf(self._span[1])
 
     def blocks(self) -> Iterator[Block]:
         """Read the recording.
@@ -140,6 +149,7 @@ class Samples:
                 stamps = messages["stamp"][messages["topic"] == k]
                 steps = steps_of(self._stamped, k, stamps)
                 self._set_back[k] = max(self._set_back[k], -steps.min())
+                self.steps_back[k].add(stamps)
             block = self._block(messages)
             self._check_rate(block.stamp)
             yield block
@@ -334,6 +344,40 @@ class Samples:
         return messages[keep]
 
 
+class StepBack:
+    """Finds stamps of a topic that go on below earlier ones, as if its clock was set back.
+
+    A message that was overtaken, or that came twice, is alone.
+    """
+
+    def __init__(self) -> None:
+        self._newest: int | None = None
+        """Largest stamp so far, ns."""
+        self._before = 0
+        """By how much the last stamp was below the largest before it, ns. -1: it was not."""
+        self.largest = 0
+        """Largest step back, ns. 0: none."""
+        self.first: int | None = None
+        """Largest stamp before the first one, ns. None: no step back."""
+
+    def add(self, stamp: Int) -> None:
+        """Take further stamps, ns."""
+        newest = int(stamp[0]) - 1 if self._newest is None else self._newest
+        highest = np.maximum.accumulate(np.concatenate([[newest], stamp]))
+        behind = np.maximum(highest[:-1] - stamp, -1)
+        depth = np.concatenate(
+            [[self._before if self._newest is not None else -1], behind]
+        )
+        several = (depth[1:] >= 0) & (depth[:-1] >= 0)
+        back = np.where(several, np.maximum(depth[1:], depth[:-1]), 0)
+        if back.any():
+            self.largest = max(self.largest, int(back.max()))
+            if self.first is None:
+                self.first = int(highest[:-1][np.argmax(back > 0)])
+        self._newest = int(highest[-1])
+        self._before = int(behind[-1])
+
+
 def steps_of(last: Int, k: int, times: Int) -> Int:
     """Return the steps (N,) to further times (N,) of topic k, ns, and keep the last time.
 
@@ -359,6 +403,16 @@ def check_sample_rate(path: Path, stamp: Int | Array, configured: float) -> None
     without_longest = steps[: -max(1, len(steps) // 100)]
     mean = 1.0 / without_longest.mean()
     off = np.array([usual, mean]) / configured
+    if (off > _NOT_SECONDS).all() or (off < 1.0 / _NOT_SECONDS).all():
+        times, side = (
+            (off[0], "closer together")
+            if off[0] > 1.0
+            else (1.0 / off[0], "farther apart")
+        )
+        raise BagError(
+            f"{path}: its stamps are about {float(f'{times:.1g}'):.0f} times {side} than sample_rate,"
+            f" {configured:g} Hz, allows: they are not in seconds and nanoseconds"
+        )
     if (off > 1.0 + WRONG_RATE).all() or (off < 1.0 - WRONG_RATE).all():
         raise BagError(
             f"{path}: sample_rate is {configured:g} Hz in the config and {figures(usual, 4)} Hz in the recording: set"

@@ -204,7 +204,7 @@ class SqliteFile(LibraryBag):
                     yield number, time, data
                     last = max(last, time)
             except sqlite3.Error as error:
-                self.note(
+                self.lose(
                     f"it is damaged ({error}): not all messages could be read in order of {order}"
                 )
                 if self._steps >= 0:

@@ -261,7 +261,7 @@ class Tlog(LibraryLog):
         """Return the samples, and note the bytes left out."""
         yield from super().portions()
         if self._lost:
-            self.note(f"{self._lost} bytes belong to no whole record and were left out")
+            self.leave_bytes(self._lost)
 
     def _messages(
         self, data: bytes, names: Sequence[str]

@@ -40,6 +40,7 @@ from fdi_ros.bag.flight_log import (
 )
 from fdi_ros.bag.library_log import Columns, LibraryLog, message_count
 from fdi_ros.bag.modes import px4_navigation_mode
+from fdi_ros.bag.raw import MUCH_LOST
 from fdi_ros.errors import BagError
 from fdi_ros.model.samples import Array, Int
 from fdi_ros.system import require
@@ -138,9 +139,11 @@ class Ulog(LibraryLog):
         bounded = _Bounded(data)
         log = _parsed(bounded, self.file.name)
         if bounded.cut or bounded.reached < len(data):
-            self.note(f"it is cut off or damaged: read up to byte {bounded.reached}")
+            much = len(data) - bounded.reached > MUCH_LOST * len(data)
+            note = self.lose if much else self.note
+            note(f"it is cut off or damaged: read up to byte {bounded.reached}")
         if log.file_corruption:
-            self.note("it is damaged: what pyulog could not read was left out")
+            self.lose("it is damaged: what pyulog could not read was left out")
         if dropouts := [1e-3 * one.duration for one in log.dropouts]:
             times = f"{len(dropouts)} time{'s' * (len(dropouts) > 1)}"
             self.note(

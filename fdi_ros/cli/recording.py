@@ -17,7 +17,14 @@ from fdi_ros.cli.outputs import Kind, Outputs, check_part, progress
 from fdi_ros.config.config import Config, with_parameters
 from fdi_ros.errors import ConfigError
 from fdi_ros.inspection.findings import Finding, Role, findings_figures, verdict_of
-from fdi_ros.inspection.fitness import candidates, needs, one_clock, recording_findings
+from fdi_ros.inspection.fitness import (
+    candidates,
+    incomplete_findings,
+    needs,
+    one_clock,
+    recording_findings,
+    short_findings,
+)
 from fdi_ros.inspection.starting_config import (
     StartingConfig,
     starting_config,
@@ -46,10 +53,13 @@ def run_inspect(arguments: Namespace) -> int:
     outputs = Outputs(arguments, ("json", "output"), inputs)
     unit = unit_of(arguments.degrees)
     urdf = None if arguments.urdf is None else read_urdf(arguments.urdf, arguments.bag)
-    reports, damage, unread = inspect(arguments.bag)
+    reports, damage, unread, incomplete = inspect(arguments.bag)
     start, refused = _starting_config(reports, arguments.bag, urdf)
     config = None if start is None else start.text
     looks = [*_mount_findings(start, arguments.bag, reports)]
+    looks += incomplete_findings(reports, incomplete)
+    learned = {} if start is None else start.parameters
+    looks += short_findings(reports, learned.get("bias.startup_bias_duration", 0.0))
     found = verdict_of([*recording_findings(reports, refused, unit, unread), *looks])
     text = f"{found.words}\n{recording_text(reports, arguments.bag)}"
     text += topics_text(reports, damage, unit)

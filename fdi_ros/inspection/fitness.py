@@ -31,7 +31,7 @@ from fdi_ros.model.geometry import MIN_CHANNELS
 from fdi_ros.model.noise import much_noisier, noisier_words
 from fdi_ros.model.samples import LARGEST_GYRO_RANGE
 from fdi_ros.monitor.inputs import is_of_a_monitor
-from fdi_ros.monitor.soundness import REPORTED, Trouble, trouble_of_unused
+from fdi_ros.monitor.soundness import REPORTED, WHOLE, Trouble, trouble_of_unused
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.system.text import LINE, figures, first_of, listed, percent, shown
 
@@ -57,6 +57,14 @@ class _DoubtfulShares(NamedTuple):
     frozen: float = 0.1
     #: the same share from which on most of what a unit sends measures nothing
     mostly_frozen: float = 0.5
+    #: share of stamps that do not increase, above which none shows when a message
+    #: was measured
+    old_stamps: float = 0.9
+    #: gain of stamps over the times of recording that no transport explains, s
+    jump: float = 1.0
+    #: factor between the intervals of stamps and of messages that no slow
+    #: simulation explains
+    pace: float = 50.0
 
 
 DOUBTFUL = _DoubtfulShares()
@@ -254,9 +262,32 @@ def _unusable(report: TopicReport) -> str:
         > DOUBTFUL.disordered * received,
         "a single message": received == 1,
         "its times of recording do not increase": not report.rate,
+        f"its stamps do not increase in {percent(report.backward / max(1, received))} of its messages": report.backward
+        > DOUBTFUL.old_stamps * received,
+        _pace_words(report): bool(_pace_words(report)),
         f"it {report.copied}: {_NO_REDUNDANCY}": bool(report.copy_of),
     }
     return next((words for words, holds in reasons.items() if holds), "")
+
+
+def _pace_words(report: TopicReport) -> str:
+    """Return by which factor stamps pass too fast or too slowly. Empty: they keep pace.
+
+    The clock of a simulation may be some times slower or faster than that of the recorder.
+    """
+    step = report.stamp_interval
+    if not step or not report.interval:
+        return ""
+    factor = report.interval / step
+    if 1.0 / DOUBTFUL.pace <= factor <= DOUBTFUL.pace:
+        return ""
+    times, side = (
+        (factor, "closer together") if factor > 1.0 else (1.0 / factor, "farther apart")
+    )
+    return (
+        f"its stamps are about {float(f'{times:.1g}'):.0f} times {side} than its messages: they are not in"
+        " seconds and nanoseconds"
+    )
 
 
 def _in_bursts(chosen: Sequence[TopicReport]) -> str:
@@ -353,6 +384,49 @@ def recording_findings(
     yield from topic_findings(chosen, unit)
 
 
+def incomplete_findings(
+    reports: Sequence[TopicReport],
+    incomplete: str = "",
+    headline: str = "READY, BUT LOOK",
+) -> Iterator[Finding]:
+    """Yield a finding on a recording that lacks messages of all units.
+
+    ``incomplete``: damage, as it continues ``the recording``. A longer hole in a whole
+    recording is a pause between two flights.
+    """
+    chosen = candidates(reports)
+    if needs(reports) or one_clock(chosen):
+        return
+    usual = max((one.interval for one in chosen), default=0.0)
+    gap = min((one.longest for one in chosen), default=0.0)
+    is_hole = gap >= max(REPORTED.missing_s, WHOLE.intervals * usual)
+    is_hole &= bool(incomplete) or gap < WHOLE.pause
+    words = [incomplete] if incomplete else []
+    if is_hole:
+        words.append(f"lacks up to {figures(gap, 2)} s of all units at once")
+    if words:
+        trouble = Trouble.DAMAGE if incomplete else Trouble.HOLE
+        sentence = f"the recording {' and '.join(words)}"
+        yield _look("damage", sentence, trouble, (), headline)
+
+
+def short_findings(reports: Sequence[TopicReport], learned: float) -> Iterator[Finding]:
+    """Yield a finding on a recording of which too little is left to judge.
+
+    ``learned``: time in which the monitor learns the biases, s.
+    """
+    chosen = candidates(reports)
+    if needs(reports) or one_clock(chosen):
+        return
+    seconds = min((1e-9 * (one.last - one.first) for one in chosen), default=0.0)
+    if seconds * (1.0 - WHOLE.judged) < learned:
+        words = (
+            f"the recording lasts {figures(seconds, 2)} s, and the monitor learns the biases for"
+            f" {figures(learned)} s of them"
+        )
+        yield _look("short", words, Trouble.SHORT, ())
+
+
 def unused_topics(
     reports: Sequence[TopicReport], unread: Sequence[tuple[str, str]] = ()
 ) -> list[tuple[str, str]]:
@@ -378,6 +452,17 @@ def message_findings(
         size = figures(max(one.set_back for one in set_back))
         words = f"the stamps of {listed(list(map(shown, names)))} go back by up to {size} s: a clock was set"
         yield _look("clock", words, Trouble.CLOCK, names, headline)
+    leads = [_gained(one) for one in chosen]
+    for one, gained in zip(chosen, leads, strict=True):
+        # Where all gained alike, it is the clock of all, or that of the recorder.
+        is_alone = max(leads) - min(leads) > DOUBTFUL.jump
+        if is_alone and abs(gained) > DOUBTFUL.jump and one.set_back <= DEFAULT_TIMEOUT:
+            side = "more" if gained > 0.0 else "less"
+            words = (
+                f"the stamps of {shown(one.topic.name)} advance by {figures(abs(gained), 3)} s {side}"
+                " than the time of recording: a clock was set"
+            )
+            yield _look("stamps", words, Trouble.STAMPS, (one.topic.name,), headline)
     for one in chosen:
         if one.backward >= DOUBTFUL.stamps * one.received:
             words = (
@@ -385,6 +470,14 @@ def message_findings(
                 f" {percent(one.backward / one.received)} of its messages: these are not used"
             )
             yield _look("stamps", words, Trouble.STAMPS, (one.topic.name,), headline)
+
+
+def _gained(one: TopicReport) -> float:
+    """Return by how much the stamps of a topic advanced more than its times of recording, s."""
+    if one.stamps is None:
+        return 0.0
+    first, last = one.stamps
+    return 1e-9 * ((last - first) - (one.last - one.first))
 
 
 def _slow_topics(chosen: Sequence[TopicReport]) -> Iterator[tuple[str, str]]:
@@ -419,6 +512,15 @@ def bad_values(
         if spiky := _spike_words(one):
             words = f"{shown(name)} has spikes: {listed(spiky)}"
             yield _look("spikes", words, Trouble.SPIKES, (name,), headline)
+    for one in chosen:
+        lacks = one.not_finite / max(1, one.received)
+        lacking = np.flatnonzero(lacks > 1.0 - REPORTED.delivered)
+        if len(lacking):
+            name = shown(one.topic.name)
+            places = listed([one.places[i] for i in lacking.tolist()])
+            words = f"{name} gave no finite value in {percent(float(lacks.max()))} of the messages: {places}"
+            who = (one.topic.name,)
+            yield _look("not finite", words, Trouble.INPUT, who, headline)
     frozen = {one.topic.name: _repeating(one) for one in chosen if _repeating(one)}
     if frozen and not saturated:
         names = [name for some in frozen.values() for name in some]

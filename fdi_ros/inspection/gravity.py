@@ -24,7 +24,7 @@ SPREAD = (0.05, 0.95)
 #: largest relative distance of these from the usual force
 LARGEST_SPREAD = 0.3
 #: fewest blocks of values: fewer are chance
-FEWEST_BLOCKS = 40
+FEWEST_WINDOWS = 40
 
 
 class _InGravity(NamedTuple):
@@ -57,7 +57,7 @@ def _in_gravity(report: TopicReport) -> _InGravity | None:
     if report.channels != 3 or report.forces.channels != 3 or report.forces.empty:
         return None
     sizes = FORCE.natural * np.linalg.norm(report.forces.means, axis=1)
-    if len(sizes) < FEWEST_BLOCKS:
+    if len(sizes) < FEWEST_WINDOWS:
         return None
     usual = float(np.median(sizes))
     spread = np.quantile(sizes, SPREAD)

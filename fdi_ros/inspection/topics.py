@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fdi_ros.bag.raw import Batch, Topic
 from fdi_ros.bag.reader import Recording
@@ -24,6 +25,7 @@ from fdi_ros.inspection.segments import Noise, NoiseSegments
 from fdi_ros.inspection.values import Values
 from fdi_ros.model.quantity import FORCE
 from fdi_ros.model.samples import Array, Int
+from fdi_ros.monitor.soundness import WHOLE
 from fdi_ros.report.layout import (
     RADIANS,
     Column,
@@ -82,6 +84,8 @@ class TopicReport:
     longest: float = 0.0
     #: stamps that do not increase
     backward: int = 0
+    #: messages that repeat stamp and values of the one before
+    again: int = 0
     #: longest step back of the stamps, s
     set_back: float = 0.0
     #: messages with an earlier time of recording than the message ahead
@@ -133,8 +137,16 @@ class TopicReport:
 
     @property
     def rate(self) -> float:
-        """Messages a second, usually."""
+        """Messages a second, usually, each counted once."""
+        if self.again >= WHOLE.stamps * max(1, self.received) and self.stamp_interval:
+            return 1.0 / self.stamp_interval
         return 1.0 / self.interval if self.interval > 0 else 0.0
+
+    @property
+    def stamp_interval(self) -> float:
+        """Usual interval of the stamps, s. 0: too few, or they do not increase."""
+        steps = np.concatenate([np.empty(0), *self.stamp_steps])
+        return usual_interval(steps) if len(steps) >= INTERVALS.settled else 0.0
 
     @property
     def burst(self) -> int:
@@ -190,6 +202,8 @@ class Inspection(NamedTuple):
     damage: tuple[str, ...]
     #: gyros that cannot be read as such, and why
     unread: tuple[tuple[str, str], ...]
+    #: what makes the recording incomplete, as it continues ``the recording``, may be empty
+    incomplete: str = ""
 
 
 def inspect(path: Path, topics: Sequence[str] = ()) -> Inspection:
@@ -223,7 +237,8 @@ def inspect(path: Path, topics: Sequence[str] = ()) -> Inspection:
         for report in reports:
             _settle(report)
         damage = recording.damage
-        return Inspection(reports, damage.report(), tuple(damage.left_out))
+        words = "is damaged" if damage.lost else ""
+        return Inspection(reports, damage.report(), tuple(damage.left_out), words)
 
 
 def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
@@ -247,9 +262,10 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
     values = decoded.values[good, : report.channels]
     force = decoded.values[good, report.channels :]
     times = times[good]
+    again = np.zeros(len(stamp), dtype=bool)
     if kind.stamped:
         _take_frames(report, batch, rows[good])
-        _take_stamps(report, stamp)
+        again = _take_stamps(report, stamp, values)
         if math.isnan(report.ahead) and len(stamp):
             report.ahead = float(np.median((stamp - times) * 1e-9))
     with np.errstate(invalid="ignore"):
@@ -268,10 +284,11 @@ def _update(report: TopicReport, batch: Batch, rows: Int) -> None:
         lasting = np.minimum(sizes[1:], sizes[:-1])[pairs].max()
         report.lasting = float(np.fmax(report.lasting, lasting))
     report.recent = np.vstack([report.recent, values])[-RECENT_MESSAGES:]
-    whole = believed.all(axis=1)
+    # A message that comes again is no sample of its own, and has no noise.
+    whole = believed.all(axis=1) & ~again
     report.segments.add(values[whole], times[whole], report.rate)
     if kind.stamped:
-        felt = np.isfinite(force).all(axis=1)
+        felt = np.isfinite(force).all(axis=1) & ~again
         report.forces.add(force[felt] / FORCE.natural, times[felt], report.rate)
 
 
@@ -330,17 +347,28 @@ def _take_frames(report: TopicReport, batch: Batch, rows: Int) -> None:
     report.frame_changes |= frame != report.frame or differ
 
 
-def _take_stamps(report: TopicReport, stamp: Int) -> None:
-    """Take the stamps (k,) of further messages, ns."""
+def _take_stamps(report: TopicReport, stamp: Int, values: Array) -> NDArray[np.bool_]:
+    """Take the stamps (k,), ns, and values (k, c) of further messages.
+
+    Return which messages (k,) repeat stamp and values of the one before.
+    """
+    again = np.zeros(len(stamp), dtype=bool)
     if not len(stamp):
-        return
+        return again
     first, *before = (int(stamp[0]),) if report.stamps is None else report.stamps
     steps = np.diff(np.concatenate([before, stamp])) * 1e-9
     report.backward += int((steps <= 0.0).sum())
     report.set_back = max(report.set_back, -float(steps.min(initial=0.0)))
+    if len(steps):
+        known = np.vstack([report.recent[-1:], values])[-len(steps) - 1 :]
+        alike = (known[1:] == known[:-1]).all(axis=1)
+        again[-len(steps) :] = (steps == 0.0) & alike
+    report.again += int(again.sum())
     if report.received <= INTERVALS.most:
-        report.stamp_steps.append(steps)
+        # A message that comes again is no second one of a burst.
+        report.stamp_steps.append(steps[~again[len(again) - len(steps) :]])
     report.stamps = first, int(stamp[-1])
+    return again
 
 
 def recording_text(reports: Sequence[TopicReport], bag: Path) -> str:

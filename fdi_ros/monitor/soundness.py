@@ -10,7 +10,7 @@ a whole flight, the live monitor its last seconds, by the same records.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
@@ -62,6 +62,41 @@ class Reported(NamedTuple):
 
 
 REPORTED = Reported()
+
+
+class Whole(NamedTuple):
+    """What a recording must have of its stream to be called whole."""
+
+    #: share of the samples that must be judged for a verdict
+    judged: float = 0.5
+    #: intervals without a sample that are a hole: samples of slow recordings are
+    #: seconds apart
+    intervals: float = 10.0
+    #: gap between two stretches, s. A shorter hole is within a stretch: messages
+    #: were lost
+    pause: float = 10.0
+    #: share of its messages from which on a unit lacks no value because of lost
+    #: messages
+    messages: float = 0.97
+    #: share of wrong stamps from which on to look: not a message that came twice
+    stamps: float = 0.01
+    #: share of the values of a channel that are repeated for long
+    frozen: float = 0.1
+
+
+WHOLE = Whole()
+
+
+class NoisyDelay(NamedTuple):
+    """A delay of a unit that explains its noise: what is left of it shows in motion."""
+
+    #: smallest delay, s
+    seconds: float = 0.01
+    #: standard deviations from which on it is certain enough
+    sigmas: float = 3.0
+
+
+NOISY_DELAY = NoisyDelay()
 
 
 class Visible(NamedTuple):
@@ -195,12 +230,21 @@ class Trouble(Enum):
         "judge only the part before the values repeat (--end), or check the driver if the vehicle moved"
         " meanwhile; at rest, coarse values repeat by themselves"
     )
+    SHORT = "record for longer, with some seconds of rest at the start"
     LEFT_OUT = "to judge {who} too, mend the cause"
     TOO_MANY = "to judge {who} too, list the units to judge in a config (--config)"
     STEPS_BACK = "judge {who} as a file of its own, and let the logger begin a new file after a restart"
     DELIVERY = "check connection, driver and bus load of {who}"
     STAMPS = (
         "check the driver of {who}: every message needs the time of its measurement"
+    )
+    DAMAGE = (
+        "copy the recording again from where it was made: the notes say what is damaged"
+    )
+    HOLE = "check what made the recording: its load, its disk and the connection to it"
+    DELAY = (
+        "measure the delay of {who} with fdi setup, or let its driver stamp each sample when it is"
+        " measured; only then check it for a loose mounting"
     )
     CLOCK = (
         "judge the parts before and after apart (--start, --end), and set clocks only before a"
@@ -380,7 +424,7 @@ def concerns_of(
         *_at_end_of_range([one for one in channels if one.saturated_s > 0.0]),
         *_rate_concerns(rate),
         *_spiky([one for one in channels if one.spikes >= REPORTED.spikes]),
-        *_noise_concerns(channels),
+        *_noise_concerns(channels, {one.name: one for one in units}),
     ]
 
 
@@ -533,6 +577,17 @@ def _incomplete(some: Sequence[ChannelHealth]) -> list[Concern]:
     return _alike(some, Word.LOOK, Trouble.DELIVERY, words)
 
 
+def repeating(channels: Sequence[ChannelHealth]) -> list[Concern]:
+    """Return a concern about channels that repeated values for long in a recording.
+
+    Live, their state says so.
+    """
+    some = [one for one in channels if one.repeated >= WHOLE.frozen]
+    most = max((one.repeated for one in some), default=0.0)
+    words = f"repeated one value for long, in {percent(most)} of the samples"
+    return _alike(some, Word.LOOK, Trouble.REPEATS, words)
+
+
 def _has_drifted(one: ChannelHealth) -> bool:
     return one.measured_in == "rad/s" and abs(one.drift) >= REPORTED.drift_rad_s
 
@@ -600,7 +655,9 @@ def _doubts(some: Sequence[ChannelHealth]) -> list[Concern]:
     ]
 
 
-def _noise_concerns(channels: Sequence[ChannelHealth]) -> list[Concern]:
+def _noise_concerns(
+    channels: Sequence[ChannelHealth], units: Mapping[str, UnitHealth]
+) -> list[Concern]:
     """Return concerns about noise: one for each unit, then one for each time of noise.
 
     Noise that lasts becomes usual, so it is compared with the other units instead.
@@ -610,21 +667,35 @@ def _noise_concerns(channels: Sequence[ChannelHealth]) -> list[Concern]:
     for one in channels:
         if one.name in ratios:
             by_unit.setdefault(one.unit or one.name, []).append(one)
-    lasting = [
-        Concern(
-            Word.LOOK,
-            Trouble.NOISE,
-            tuple(one.name for one in own),
-            _lasting_noise_words(own, max(ratios[one.name] for one in own)),
-        )
-        for own in by_unit.values()
-    ]
+    lasting = []
+    for name, own in by_unit.items():
+        words = _lasting_noise_words(own, max(ratios[one.name] for one in own))
+        trouble = Trouble.NOISE
+        if name in units and (late := _late_words(units[name])):
+            words += f": {late}"
+            trouble = Trouble.DELAY
+        who = tuple(one.name for one in own)
+        lasting.append(Concern(Word.LOOK, trouble, who, words))
     brief = [
         one
         for one in channels
         if one.noisy_s >= REPORTED.noisy_s and (one.unit or one.name) not in by_unit
     ]
     return [*lasting, *_noisy_for_a_time(brief)]
+
+
+def _late_words(unit: UnitHealth) -> str:
+    """Return the delay of a unit, if it may be the cause of its noise. Empty: it is not."""
+    delay, std = unit.delay_s, unit.delay_std_s
+    if delay is None or std is None:
+        return ""
+    if abs(delay) < max(NOISY_DELAY.seconds, NOISY_DELAY.sigmas * std):
+        return ""
+    side = "late" if delay > 0.0 else "early"
+    return (
+        f"its stamps are {figures(1000 * abs(delay), 2)} ms {side} against those of {unit.delay_to},"
+        " which looks like noise in motion"
+    )
 
 
 def _lasting_noise_words(own: Sequence[ChannelHealth], ratio: float) -> str:

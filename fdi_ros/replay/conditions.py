@@ -15,10 +15,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from fdi_ros.errors import ConfigError
+from fdi_ros.monitor.soundness import WHOLE
 from fdi_ros.replay.episodes import ROOM, episode_words
 from fdi_ros.replay.outcomes import Outcome
 from fdi_ros.replay.summary import Judgement
-from fdi_ros.replay.verdict import LEAST_JUDGED
 from fdi_ros.replay.words import unchecked_words
 from fdi_ros.system.text import did_you_mean
 
@@ -50,7 +50,7 @@ with a declaration, injected or not. ``judged``: share of the samples that was j
 _QUANTITIES = FAULT_QUANTITIES | RECORDING_QUANTITIES
 CHANNEL_STATES = ("faulty", "ambiguous", "stale", "ok")
 """States to ask for: declared alone, declared in a set, silent, none of these."""
-_DEFAULTS = (f"judged>={LEAST_JUDGED:g}", "unchecked=0")
+_DEFAULTS = (f"judged>={WHOLE.judged:g}", "unchecked=0")
 """Conditions that hold for a quantity that the user does not mention."""
 
 

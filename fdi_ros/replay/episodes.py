@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi_ros.monitor.soundness import WHOLE
 from fdi_ros.replay.warming import Warming
 from fdi_ros.report.layout import FORCES, RADIANS, Unit
 from fdi_ros.system.text import figures, listed, percent, plus_minus
@@ -28,7 +29,7 @@ class EpisodeTimes(NamedTuple):
 
     #: gap between two stretches. A shorter hole is within a stretch: messages were
     #: lost
-    stretch_gap: float = 10.0
+    stretch_gap: float = WHOLE.pause
     #: longest time without samples over which faults are injected and curves are
     #: drawn
     longest_hole: float = 1.0

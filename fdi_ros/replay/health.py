@@ -21,7 +21,12 @@ from fdi_ros.core.states import ChannelState
 from fdi_ros.model.samples import Array, Int, flag_runs
 from fdi_ros.monitor.output import Output
 from fdi_ros.monitor.recent import USUAL_QUANTILE
-from fdi_ros.monitor.soundness import UnitHealth, own_noise
+from fdi_ros.monitor.soundness import (
+    REPORTED,
+    WHOLE,
+    UnitHealth,
+    own_noise,
+)
 from fdi_ros.monitor.status import CERTAIN_SIGMAS
 
 
@@ -66,12 +71,17 @@ class _Bins(NamedTuple):
 BINS = _Bins()
 
 
+MOST_HOLES = 1000
+"""Largest number of holes that are kept."""
+
+STEADY_TIME = 0.1
+"""Share of the time that these intervals are at least."""
 NOISE_WINDOW = 3.0
 """Duration of a window in which noise is measured, s: some swings of a loose mount."""
 LEAST_USUAL_WINDOWS = 3
 """Smallest number of windows for a noise: fewer are dominated by the start-up."""
 
-LEAST_MOTION = 3.0
+LEAST_TURN = 3.0
 """Size of the rate over that of the residual, from which on a share of the rate can be seen in it."""
 LEAST_LEFT = 0.2
 """Largest share of the variance of the residual that a scale error leaves, where it is its main part."""
@@ -151,7 +161,11 @@ class Deliveries:
         alike = int(counts[near].sum())
         if alike < max(BINS.steady * counts.sum(), WINDOWS.messages):
             return 0.0
-        return float(alike / self._lengths[k, near].sum())
+        seconds = float(self._lengths[k, near].sum())
+        # Messages that come twice, or in pairs, are close together for little of the time.
+        if seconds < STEADY_TIME * self._lengths[k].sum():
+            return 0.0
+        return alike / seconds
 
     def result(self) -> list[Delivery]:
         """Return how each topic delivered."""
@@ -260,6 +274,34 @@ class Usual(NamedTuple):
     """Whether its errors are mainly of that kind."""
 
 
+class Holes:
+    """Finds the times in which no unit delivered, between the first sample and the last."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+        """Stamp of the last sample, ns."""
+        self._usual = np.inf
+        """Usual interval of the samples, ns."""
+        self.found: list[tuple[int, int]] = []
+        """Stamps of the samples before and after each of the first holes, ns."""
+
+    def add(self, stamp: Int) -> None:
+        """Take the stamps of the next samples, ns."""
+        if not len(stamp):
+            return
+        before = stamp[0] if self._last is None else self._last
+        joined = np.concatenate([[before], stamp])
+        steps = np.diff(joined)
+        if len(stamp) > 1:
+            self._usual = float(np.median(steps[1:]))
+        elif self._last is not None:
+            self._usual = min(self._usual, float(steps[0]))
+        longest = max(REPORTED.missing_s * 1e9, WHOLE.intervals * self._usual)
+        for k in np.flatnonzero(steps >= longest)[: MOST_HOLES - len(self.found)]:
+            self.found.append((int(joined[k]), int(joined[k + 1])))
+        self._last = int(stamp[-1])
+
+
 class UsualNoise:
     """Measures the noise of channels, block after block: the median of windows.
 
@@ -339,7 +381,7 @@ def _usual(noise: Array, moments: Array) -> Usual:
     usual = float(np.median(noise[measured]))
     residual, rate, both = moments[measured].T
     # Else noise that is in the rate, too, looks like a scale error.
-    if residual.sum() * LEAST_MOTION**2 >= rate.sum():
+    if residual.sum() * LEAST_TURN**2 >= rate.sum():
         return Usual(usual)
     followed = both.sum() / rate.sum()
     # A swing of its own has the frequency of a rate for a time, but changes in size and sign.

@@ -11,13 +11,20 @@ noise, no set is declared any more: the noise of the unit is the rest of that fa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
 from fdi_ros.monitor.soundness import REPORTED
-from fdi_ros.replay.episodes import ROOM, Episode, Step, Stretch, episode_words
+from fdi_ros.replay.episodes import (
+    EPISODE_TIMES,
+    ROOM,
+    Episode,
+    Step,
+    Stretch,
+    episode_words,
+)
 
 
 class _LooseUnit(NamedTuple):
@@ -109,6 +116,42 @@ def join_noise(
                 left.remove(later)
         joined.append(_noisy_unit(run, times, until, end, unit_of))
     return joined
+
+
+def with_all_candidates(
+    one: Episode, who_of: Callable[[Sequence[str]], str]
+) -> Episode:
+    """Return a set that was withdrawn with all channels that it may have been of.
+
+    As evidence fades, a set shrinks. A step that lasted for less than `EPISODE_TIMES.brief` before the
+    end clears no channel of the steps before it, and names none. ``who_of`` returns the
+    words for a set of channels.
+    """
+    if one.state != "AMBIGUOUS" or one.stands or one.longest_s is not None:
+        return one
+    if one.halves:
+        return one
+    lengths = list(_lengths(one))
+    lasted = [
+        k for k, (_, seconds) in enumerate(lengths) if seconds >= EPISODE_TIMES.brief
+    ]
+    begin = lasted[-1] if lasted else 0
+    channels = {name for step in one.steps[begin:] for name in step.channels}
+    if channels == set(one.channels):
+        return one
+    since = one.steps[begin].at_s
+    ordered = tuple(sorted(channels))
+    step = Step(since, one.state, ordered, who_of(ordered))
+    whole = replace(
+        one,
+        channels=ordered,
+        who=step.who,
+        since_s=since,
+        steps=(*one.steps[:begin], step),
+        candidates=(),
+        apart=None,
+    )
+    return replace(whole, words=episode_words(whole))
 
 
 def _noise_after(

@@ -32,6 +32,7 @@ from fdi_ros.core.states import Reason
 from fdi_ros.faults.fault import Fault, Injector, fault_from, parse_fault
 from fdi_ros.inspection.starting_config import assumed_config, starting_config_of
 from fdi_ros.inspection.values import Values
+from fdi_ros.model.geometry import one_of_words
 from fdi_ros.model.quantity import RATE
 from fdi_ros.model.samples import Array, Block, Int
 from fdi_ros.monitor.diagnostics import degraded
@@ -47,13 +48,19 @@ from fdi_ros.monitor.status import UNUSUAL_ERRORS, Status
 from fdi_ros.replay.episodes import EPISODE_TIMES, Story, join_halves, pieces
 from fdi_ros.replay.health import (
     Deliveries,
+    Holes,
     UsualNoise,
     with_context,
     with_delivery,
 )
 from fdi_ros.replay.outcomes import Evaluation, finite
 from fdi_ros.replay.recorder import Recorder
-from fdi_ros.replay.recurring import NoisyTime, join_noise, join_recurring
+from fdi_ros.replay.recurring import (
+    NoisyTime,
+    join_noise,
+    join_recurring,
+    with_all_candidates,
+)
 from fdi_ros.replay.span_means import SpanMeans, Temperature, with_warming
 from fdi_ros.replay.summary import (
     AutopilotText,
@@ -202,6 +209,8 @@ class Judge(Walk):
         self.evaluation = Evaluation(
             injector, pipeline.geometry, pipeline.channel_names
         )
+        self.holes = Holes()
+        """Times in which no unit delivered."""
         self._intervals: list[tuple[float, int]] = []
         """Median interval, ns, and number of samples of each piece."""
         self._recorders = [
@@ -239,6 +248,7 @@ class Judge(Walk):
     def feed(self, block: Block) -> None:
         """Pass a piece without a long gap through the monitor, with the faults injected."""
         block = self.pipeline.arranged(block)
+        self.holes.add(block.stamp)
         if len(block) > 1:
             interval = float(np.median(np.diff(block.stamp)))
             self._intervals.append((interval, len(block)))
@@ -326,6 +336,7 @@ class Judge(Walk):
         story = _joined(stories, units, self._noisy_times(status))
         episodes = []
         for one in story.episodes:
+            one = with_all_candidates(one, self._words_for)
             known = [
                 followed.fault
                 for followed in evaluation.faults
@@ -344,6 +355,17 @@ class Judge(Walk):
             replace(monitor, rate=rate),
             replace(story, episodes=tuple(episodes)),
         )
+
+    def _words_for(self, names: Sequence[str]) -> str:
+        """Return the words for a set of channels of one half."""
+        half = next(
+            half
+            for half in self.pipeline.halves
+            if names[0] in half.geometry.channel_names
+        )
+        geometry = half.geometry
+        channels = [geometry.channel_names.index(name) for name in names]
+        return one_of_words(geometry, channels, half.quantity.name)
 
     def explained(self, story: Story, context: FlightContext, origin: int) -> Story:
         """Return a story with the errors that follow a temperature of the flight log.
@@ -713,10 +735,26 @@ def _stream_result(samples: Samples, settings: Config, judge: Judge) -> StreamRe
         disordered=samples.disordered,
         alignment=dict(zip(samples.topics, counters, strict=True)),
         damage=samples.recording.damage.losses(),
+        lost=samples.recording.damage.lost,
+        cut_off=samples.recording.damage.cut_off and samples.reads_to_end,
+        holes=tuple(
+            (judge.evaluation.time(begin), judge.evaluation.time(end))
+            for begin, end in judge.holes.found
+        ),
         set_back_s=samples.set_back_s,
+        steps_back=_steps_back(samples, judge),
         facts=tuple(samples.recording.damage.facts),
         unused=tuple(samples.recording.damage.left_out),
     )
+
+
+def _steps_back(samples: Samples, judge: Judge) -> dict[str, tuple[float, float]]:
+    """Return when the clock of each topic was set back, s from the first message, and by how much, s."""
+    return {
+        topic: (judge.evaluation.time(one.first), 1e-9 * one.largest)
+        for topic, one in zip(samples.topics, samples.steps_back, strict=True)
+        if samples.source.stamped and one.first is not None
+    }
 
 
 def _autopilot_texts(texts: Iterable[LogText], judge: Judge) -> Iterator[AutopilotText]:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from fdi_ros.bag.flight_context import FlightContext
 from fdi_ros.monitor.output import time_index
 from fdi_ros.monitor.soundness import (
+    REPORTED,
+    WHOLE,
     ChannelHealth,
     Concern,
     RateHealth,
@@ -19,12 +21,13 @@ from fdi_ros.monitor.soundness import (
     UnitHealth,
     Word,
     concerns_of,
+    repeating,
 )
 from fdi_ros.replay.episodes import NOTHING_HAPPENED, Story
 from fdi_ros.replay.outcomes import UNCHECKED_STATES, Scores
 from fdi_ros.report.layout import Severity
 from fdi_ros.system import require
-from fdi_ros.system.text import figures
+from fdi_ros.system.text import figures, percent
 
 if TYPE_CHECKING:
     import pandas
@@ -137,6 +140,13 @@ class SampleRate:
     """Usual rate of the recording, Hz. None: too few samples."""
 
 
+def _of_several(words: str) -> str:
+    """Return words on the stamps of one unit as they are said of several."""
+    verb, _, rest = words.partition(" ")
+    verbs = {"has": "have", "repeats": "repeat"}
+    return f"{verbs[verb]} {rest}".replace(" its ", " their ")
+
+
 @dataclass(frozen=True)
 class StreamResult:
     """The recording itself."""
@@ -157,10 +167,94 @@ class StreamResult:
     """What could not be read, one line for each place."""
     unused: tuple[tuple[str, str], ...] = ()
     """Topics of gyros that were left out, and why."""
+    steps_back: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Time at which the clock of each topic was set back, s from the first message, and by how
+    much, s. No entry: never."""
     set_back_s: float = 0.0
     """By how much the stamps of all units were set back together, s. 0: never."""
     facts: tuple[str, ...] = ()
     """What readers of the recording must know, and is no damage."""
+    lost: bool = False
+    """Whether messages are missing because the recording is damaged."""
+    cut_off: bool = False
+    """Whether the recording ends before its recorder closed it."""
+    holes: tuple[tuple[float, float], ...] = ()
+    """Begin and end of the times in which no unit delivered, s from the first message."""
+
+    @property
+    def damage_concerns(self) -> list[Concern]:
+        """Reasons not to trust that the recording is whole.
+
+        A recording that ends where the power goes is whole up to there.
+        """
+        who = ("the recording",)
+        concerns = []
+        # Between two flights in one recording nothing is missing, as far as that is known.
+        holes = [
+            (begin, end)
+            for begin, end in self.holes
+            if self.lost or end - begin < WHOLE.pause
+        ]
+        if holes:
+            begin, end = holes[0]
+            seconds = sum(end - begin for begin, end in holes)
+            damaged = "is damaged and " if self.lost else ""
+            when = f"from {begin:.1f} s to {end:.1f} s"
+            if len(holes) > 1:
+                when = f"in {len(holes)} parts, the first {when}"
+            words = f"{damaged}lacks {seconds:.1f} s of all units, {when}"
+            trouble = Trouble.DAMAGE if self.lost else Trouble.HOLE
+            concerns.append(Concern(Word.LOOK, trouble, who, words))
+        elif self.lost:
+            words = "is damaged: some messages are missing, at its end or between"
+            concerns.append(Concern(Word.LOOK, Trouble.DAMAGE, who, words))
+        return concerns
+
+    def stamp_concerns(
+        self, units: Sequence[UnitHealth], samples: int
+    ) -> list[Concern]:
+        """Return concerns about units whose stamps are wrong while their messages come."""
+        alike: dict[str, list[str]] = {}
+        for unit in units:
+            if words := self._stamp_words(unit, samples):
+                alike.setdefault(words, []).append(unit.name)
+        return [
+            Concern(
+                Word.LOOK,
+                Trouble.STAMPS,
+                tuple(names),
+                words if len(names) == 1 else _of_several(words),
+            )
+            for words, names in alike.items()
+        ]
+
+    def _stamp_words(self, unit: UnitHealth, samples: int) -> str:
+        """Return what is wrong with the stamps of a unit. Empty: nothing."""
+        counters = self.alignment.get(unit.topic, {})
+        received = max(1, counters.get("received", 0))
+        ahead = counters.get("jumped", 0)
+        # Together they are ahead of nobody.
+        jumped = [one.get("jumped", 0) for one in self.alignment.values()]
+        if min(jumped, default=0) == ahead:
+            ahead = 0
+        if ahead >= WHOLE.stamps * received:
+            share = percent(ahead / received)
+            return f"has stamps far ahead of those of the other units in {share} of its messages: these were not used"
+        old = counters.get("duplicate", 0) + counters.get("backward", 0)
+        back = self.steps_back.get(unit.topic)
+        if back is not None and not self.set_back_s:
+            at, by = back
+            return f"has stamps that go back by {figures(by, 2)} s at {at:.1f} s, as if its clock was set"
+        if old >= WHOLE.stamps * received:
+            return f"repeats old stamps in {percent(old / received)} of its messages: these were not used"
+        missing = counters.get("missing", 0)
+        came = received >= WHOLE.messages * samples
+        if came and missing >= (1.0 - REPORTED.delivered) * samples:
+            return (
+                f"has stamps so irregular that {percent(missing / samples)} of the samples lack its value,"
+                " though its messages came"
+            )
+        return ""
 
     @property
     def clock_concerns(self) -> list[Concern]:
@@ -225,6 +319,11 @@ class Judgement:
         ]
 
     @property
+    def is_cut_off(self) -> bool:
+        """Whether the recording ends before its recorder closed it."""
+        return False
+
+    @property
     def has_only_brief_sets(self) -> bool:
         """Whether all that was declared are sets that ended within `EPISODE_TIMES.brief`.
 
@@ -257,7 +356,10 @@ class Judgement:
                 else replace(one, own_noise_rad_s=None)
                 for one in channels
             ]
-        return concerns_of(channels, self.monitor.units, rate=self.monitor.rate)
+        said = {name for one in self.story.declared for name in one.ever}
+        others = [one for one in self.monitor.channels if one.name not in said]
+        found = concerns_of(channels, self.monitor.units, rate=self.monitor.rate)
+        return [*found, *repeating(others)]
 
 
 @dataclass(frozen=True)
@@ -290,10 +392,36 @@ class Summary(Judgement):
     """Temperatures, throttle and flight modes of a flight log."""
 
     @property
+    def is_cut_off(self) -> bool:
+        """Whether the recording ends before its recorder closed it."""
+        return self.stream.cut_off
+
+    @property
     def concerns(self) -> list[Concern]:
         """Reasons not to call the recording healthy, topics that were not judged included."""
         unused = concerns_of((), (), self.stream.unused)
-        return [*self.stream.clock_concerns, *super().concerns, *unused]
+        stream = self.stream
+        monitor = self.monitor
+        stamps = stream.stamp_concerns(monitor.units, self.scores.samples)
+        wrong = {name for one in stamps for name in one.who}
+        unit_of = {one.name: one.unit for one in monitor.channels}
+        others = []
+        for one in super().concerns:
+            units = {unit_of.get(name, name) for name in one.who}
+            is_of_stamps = bool(units) and units <= wrong
+            # What lacks a value, or is at a wrong time, is so by the stamps.
+            if is_of_stamps and one.trouble is Trouble.DELIVERY:
+                continue
+            if is_of_stamps and one.trouble is Trouble.NOISE:
+                one = one._replace(trouble=Trouble.DELAY)
+            others.append(one)
+        return [
+            *stream.damage_concerns,
+            *stream.clock_concerns,
+            *stamps,
+            *others,
+            *unused,
+        ]
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return the changes of state as a table. Needs pandas.

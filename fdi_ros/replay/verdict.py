@@ -14,6 +14,7 @@ from collections.abc import Collection, Sequence
 from fdi_ros.core.states import Reason
 from fdi_ros.monitor.soundness import (
     REPORTED,
+    WHOLE,
     Concern,
     Trouble,
     Word,
@@ -23,6 +24,7 @@ from fdi_ros.monitor.soundness import (
 )
 from fdi_ros.replay.episodes import (
     EPISODE_TIMES,
+    HALVES,
     ROOM,
     Episode,
     Size,
@@ -38,8 +40,8 @@ from fdi_ros.replay.summary import Judgement, ReplayVerdict
 from fdi_ros.report.layout import RADIANS, Unit
 from fdi_ros.system.text import figures, first_of, listed, percent
 
-LEAST_JUDGED = 0.5
-"""Share of the samples that must be judged for a verdict."""
+_OF_TIME = (Trouble.CLOCK, Trouble.STAMPS)
+"""Kinds of concerns about times. Wrong times make other figures wrong."""
 SILENT_TO_END = 1.0
 """Time to the end for which a channel must be silent or unchecked to be reported, s. A channel with a later
 value delivers to the end."""
@@ -50,7 +52,8 @@ def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
     if judgement.scores.faults:
         return _verdict_on_faults(judgement)
     faulty = faulty_episodes(judgement)
-    if faulty:
+    explained = noise_throughout(judgement)
+    if faulty and not explained:
         names = dict.fromkeys(name for one in faulty for name in one.channels)
         return ReplayVerdict(
             Word.FAULTY.value,
@@ -63,16 +66,17 @@ def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
         return ReplayVerdict(Word.CANNOT_TELL.value, sentence, ())
     concerns = judgement.concerns
     word = word_of(concerns)
-    deciding = [
-        one for one in concerns if one.word is word or one.trouble is Trouble.CLOCK
-    ]
+    deciding = [one for one in concerns if one.word is word or one.trouble in _OF_TIME]
     names = dict.fromkeys(name for one in deciding for name in one.who)
     seconds = judgement.scores.duration_s
     if word is Word.HEALTHY:
         sentence = _healthy_words(judgement)
     else:
         listed_ones = first_of(list(map(str, deciding)), REPORTED.concerns, "; ")
-        sentence = f"no fault was found in {seconds:.1f} s, but {listed_ones}."
+        found = "lasted" if explained else "was found"
+        sentence = f"no fault {found} in {seconds:.1f} s, but {listed_ones}."
+        if explained:
+            sentence += f" {_doubted_words(faulty)}"
         sentence += f" What to do: {advice_on(deciding)}"
     return ReplayVerdict(word.value, f"{word.value}: {sentence}.", tuple(names))
 
@@ -119,11 +123,13 @@ def unjudged_words(judgement: Judgement) -> str:
     bias = judgement.monitor.bias
     if scores.samples_judged == 0:
         words = f"none of {scores.samples} samples was judged"
-        if bias.state == "learning":
+        if bias.state == "learning" and not _badly_stamped(judgement):
             return f"{words}, because the biases were still being learned"
+        if _badly_stamped(judgement):
+            return words
         return f"{words} (start-up bias: {bias.state})"
     share = scores.samples_judged / scores.samples
-    if share < LEAST_JUDGED:
+    if share < WHOLE.judged:
         return f"only {percent(share)} of {scores.samples} samples were judged"
     if bias.far:
         # The largest one stands for all: they may be many.
@@ -143,6 +149,8 @@ def unjudged_words(judgement: Judgement) -> str:
 def _to_judge(judgement: Judgement) -> str:
     """Return what to do about a recording that was not judged as a whole."""
     bias = judgement.monitor.bias
+    if stamped := _badly_stamped(judgement):
+        return Trouble.STAMPS.advice(sorted(stamped))
     if bias.far:
         return f"check {listed(bias.far)}, or raise turn_on_std in a config if such a bias is usual"
     if bias.state == "learning":
@@ -202,8 +210,9 @@ def _healthy_words(judgement: Judgement) -> str:
         and judgement.scores.end_s - one.since_s >= SILENT_TO_END
     ]
     more = f"; not checked at the end: {listed(end)}" if end else ""
+    until = ", where the recording is cut off" if judgement.is_cut_off else ""
     return (
-        f"no fault was found in {judgement.scores.duration_s:.1f} s;"
+        f"no fault was found in {judgement.scores.duration_s:.1f} s{until};"
         f" {len(channels)} channels, {share}{more}"
     )
 
@@ -216,16 +225,16 @@ def _faulty_sentences(
 ) -> str:
     """Return sentences on the first episode, and the names in the others."""
     first = faulty[0]
-    if frozen := _frozen_unit(judgement, first):
+    if frozen := _frozen_sensors(judgement, first):
         sentences = [
-            f"{frozen}, all axes, {_when(first)}.",
+            f"{frozen}, {_when(first)}.",
             f"Reason: {Reason.FROZEN.value}.",
         ]
     else:
         sentences = [
             f"{_who(first)} {_when(first)}.",
             *_size_sentences(first, unit),
-            *_reason_sentences(first),
+            *_reason_sentences(first, _badly_stamped(judgement)),
         ]
     if first.since_s - first.start_s >= EPISODE_TIMES.least_before:
         sentences.append(f"First seen at {first.start_s:.1f} s.")
@@ -273,12 +282,21 @@ def _without_brief_sets(faulty: Sequence[Episode]) -> Sequence[Episode]:
 def _advice(judgement: Judgement, faulty: Sequence[Episode]) -> str:
     """Return what to do before the next flight about all faults."""
     unit_of = {one.name: one.unit or one.name for one in judgement.monitor.channels}
+    noisy = {
+        unit_of[name]
+        for one in noise_behind(judgement)
+        for name in one.who
+        if name in unit_of
+    }
     named: dict[str, None] = {}
     doubted: list[list[str]] = []
     for one in faulty:
         owners = [unit_of.get(name, name) for name in one.channels]
         units = list(dict.fromkeys(owners))
         if one.state == "AMBIGUOUS" and len(units) > 1:
+            # Noise or wrong stamps of a unit in the set explain it.
+            explained = _badly_stamped(judgement) | noisy
+            named |= {name: None for name in units if name in explained}
             doubted.append(units)
         else:
             named |= dict.fromkeys(units)
@@ -289,7 +307,9 @@ def _advice(judgement: Judgement, faulty: Sequence[Episode]) -> str:
         is_loose = _shakes(judgement, named) or any(
             one.noisy_from_s is not None for one in faulty
         )
+        stamped = named.keys() & _badly_stamped(judgement)
         work = "checked for a loose mounting" if is_loose else "checked"
+        work = "checked, first the stamps of its driver," if stamped else work
         units = [name for name in dict.fromkeys(unit_of.values()) if name in named]
         steps = [f"{listed(units)} {are} {work} or replaced"]
     else:
@@ -304,7 +324,12 @@ def _advice(judgement: Judgement, faulty: Sequence[Episode]) -> str:
 
 def _shakes(judgement: Judgement, units: Collection[str]) -> bool:
     """Whether noise explains all declarations, and is of one of some units."""
-    noisy = {name for one in noise_behind(judgement) for name in one.who}
+    noisy = {
+        name
+        for one in noise_behind(judgement)
+        if one.trouble is Trouble.NOISE
+        for name in one.who
+    }
     return any(
         one.name in noisy and (one.unit or one.name) in units
         for one in judgement.monitor.channels
@@ -312,8 +337,18 @@ def _shakes(judgement: Judgement, units: Collection[str]) -> bool:
 
 
 def set_clocks(judgement: Judgement) -> list[Concern]:
-    """Return the concerns about clocks that were set. Every verdict lists them."""
-    return [one for one in judgement.concerns if one.trouble is Trouble.CLOCK]
+    """Return the concerns about clocks and stamps. Every verdict lists them."""
+    return [one for one in judgement.concerns if one.trouble in _OF_TIME]
+
+
+def _badly_stamped(judgement: Judgement) -> set[str]:
+    """Return the units whose stamps are wrong."""
+    return {
+        name
+        for one in judgement.concerns
+        if one.trouble is Trouble.STAMPS
+        for name in one.who
+    }
 
 
 def noise_behind(judgement: Judgement) -> list[Concern]:
@@ -323,11 +358,46 @@ def noise_behind(judgement: Judgement) -> list[Concern]:
         return []
     if not all(one.declares for one in faulty):
         return []
-    return [one for one in judgement.concerns if one.trouble is Trouble.NOISE]
+    kinds = (Trouble.NOISE, Trouble.DELAY)
+    return [one for one in judgement.concerns if one.trouble in kinds]
 
 
-def _frozen_unit(judgement: Judgement, one: Episode) -> str:
-    """Return the unit of a set if the whole unit is frozen at the end. Empty: it is not."""
+def noise_throughout(judgement: Judgement) -> list[Concern]:
+    """Return the noise of units from the start on that explains all declarations.
+
+    Noise of one unit that is larger than that of the others all the time, as of another
+    model, brings brief sets about that unit and channels beside it. Noise that began
+    during the recording is a change, and the sets are its first sign.
+    """
+    noise = noise_behind(judgement)
+    changed = {
+        one.name
+        for one in judgement.monitor.channels
+        if one.noisy_s >= REPORTED.noisy_s
+    }
+    lasting = [one for one in noise if changed.isdisjoint(one.who)]
+    names = {name for one in lasting for name in one.who}
+    if all(names & one.ever for one in faulty_episodes(judgement)):
+        return lasting
+    return []
+
+
+def _doubted_words(sets: Sequence[Episode]) -> str:
+    """Return a sentence on brief sets that noise explains."""
+    first = sets[0]
+    rest = len(sets) - 1
+    more = f" ({rest} more like this)" if rest else ""
+    return (
+        f"A fault of {first.who.removesuffix(',')} was suspected {_when(first)}{more}:"
+        " such noise causes that."
+    )
+
+
+def _frozen_sensors(judgement: Judgement, one: Episode) -> str:
+    """Return the unit of a set, and which of its sensors are frozen at the end if the set is of these.
+
+    Empty: they are not all frozen.
+    """
     units = {
         channel.unit
         for channel in judgement.monitor.channels
@@ -336,13 +406,17 @@ def _frozen_unit(judgement: Judgement, one: Episode) -> str:
     if one.state != "AMBIGUOUS" or len(units) != 1 or "" in units:
         return ""
     (unit,) = units
-    own = [
-        channel
-        for channel in judgement.monitor.channels
-        if channel.unit == unit and channel.measured_in == one.measured_in
-    ]
-    frozen = all(channel.reason == Reason.FROZEN.value for channel in own)
-    return unit if frozen else ""
+    by_half: dict[str, list[bool]] = {}
+    for channel in judgement.monitor.channels:
+        if channel.unit == unit:
+            is_frozen = channel.reason == Reason.FROZEN.value
+            by_half.setdefault(channel.measured_in, []).append(is_frozen)
+    shown = {half.measured_in for half in one.halves or (one,)}
+    if not all(all(by_half[half]) for half in shown):
+        return ""
+    if all(map(all, by_half.values())):
+        return f"{unit}, all axes"
+    return f"{unit}, {' and '.join(f'all {HALVES[half]}' for half in HALVES if half in shown)}"
 
 
 _WITHOUT_SIZE = tuple(
@@ -484,10 +558,16 @@ def _share_words(share: float, unit: Unit) -> str:
     return f"{figures(100.0 * abs(share), 2)} % too {'little' if share < 0 else 'much'}"
 
 
-def _reason_sentences(one: Episode) -> list[str]:
-    """Return a sentence on the reason, unless the reason is a mere disagreement."""
+def _reason_sentences(one: Episode, badly_stamped: Collection[str]) -> list[str]:
+    """Return a sentence on the reason, unless the reason is a mere disagreement.
+
+    ``badly_stamped``: units whose stamps are wrong.
+    """
     if recurring := [half for half in one.halves or (one,) if half.sets > 1]:
         sets = max(half.sets for half in recurring)
+        units = {name.rpartition(".")[0] for name in one.channels}
+        if not units.isdisjoint(badly_stamped):
+            return [f"It came and went {sets} times, as errors by wrong stamps do."]
         return [f"It came and went {sets} times, as the error of a loose unit does."]
     reason = one.evidence.reason
     common = (Reason.DISAGREES.value, Reason.DRIFTED.value, Reason.NO_DATA.value)

@@ -25,6 +25,7 @@ from fdi_ros.inspection.fitness import (
     bad_values,
     copy_words,
     frozen_words,
+    incomplete_findings,
     message_findings,
     topic_findings,
     unused_topics,
@@ -32,9 +33,8 @@ from fdi_ros.inspection.fitness import (
 from fdi_ros.inspection.topics import topic_columns
 from fdi_ros.model.noise import much_noisier, noisier_words, summary_line
 from fdi_ros.model.samples import Array, flag_runs
-from fdi_ros.monitor.soundness import REPORTED, Trouble
+from fdi_ros.monitor.soundness import REPORTED, WHOLE, Trouble
 from fdi_ros.replay.sweep_report import declared_figures
-from fdi_ros.replay.verdict import LEAST_JUDGED
 from fdi_ros.report.layout import (
     FORCES,
     RADIANS,
@@ -589,6 +589,7 @@ def setup_findings(found: SetupResult, unit: Unit = RADIANS) -> Iterator[Finding
             advice=Trouble.LEFT_OUT.advice([topic]),
         )
     of_messages = [
+        *incomplete_findings(found.reports, found.incomplete, LOOK),
         *message_findings(found.chosen, LOOK),
         *bad_values(found.chosen, LOOK),
         *topic_findings(found.chosen, unit),
@@ -659,12 +660,12 @@ def _worth(found: SetupResult, unit: Unit) -> Iterator[Finding]:
             headline="DO NOT USE",
             advice="check driver and bus, and record again",
         )
-    elif tried.judged < LEAST_JUDGED:
+    elif tried.judged < WHOLE.judged:
         share = f"only {percent(tried.judged)}" if tried.judged else "none"
         why = found.refused or tried.note or "channels are missing"
         words = f"the monitor judges {share} of the samples in the proof: {why}"
         yield Finding(
-            warning, "judged", words, (), tried.judged, None, LEAST_JUDGED, "DO NOT USE"
+            warning, "judged", words, (), tried.judged, None, WHOLE.judged, "DO NOT USE"
         )
     elif tried.declared:
         words = f"the monitor declares {times_words(tried.declared)} in {proof.source}: a sensor is faulty"

@@ -271,6 +271,8 @@ class SetupResult(LearnedSettings):
     reports: Sequence[TopicReport] = ()
     #: unreadable parts of the recording, a sentence each
     damage: tuple[str, ...] = ()
+    #: what makes the recording incomplete, as it continues ``the recording``, may be empty
+    incomplete: str = ""
     #: gyros that cannot be read as such, and why
     unread: tuple[tuple[str, str], ...] = ()
     #: the topics of the gyros
@@ -329,7 +331,7 @@ def set_up(
     the proof, by default a part of this one. `FdiError` if the recording is unreadable
     or has no gyros, or no monitor can be built.
     """
-    reports, damage, unread = inspect(bag)
+    reports, damage, unread, incomplete = inspect(bag)
     chosen = candidates(reports)
     lacking = needs(reports)
     if not chosen:
@@ -368,6 +370,7 @@ def set_up(
         reports=reports,
         damage=damage,
         unread=unread,
+        incomplete=incomplete,
         chosen=chosen,
         replayed=_replayed(bag, found.config, start, end),
     )

@@ -124,7 +124,7 @@ def test_bombs_are_read_as_far_as_their_size_explains(
 ):
     path = made(tmp_path, records())
     with bounded():
-        reports, damage, _ = inspect(path)
+        reports, damage, *_ = inspect(path)
     assert len(reports) <= 4096
     assert words in " ".join(damage)
     count = sum(report.received for report in reports)
@@ -154,7 +154,7 @@ def test_names_and_descriptions_that_are_too_long_are_left_out(tmp_path):
         + record(3, struct.pack("<H", 2) + bytes(1 << 21))
     )
     made(tmp_path, names + message() + message(1) + message(0, 2**63 + 5))
-    reports, damage, _ = inspect(tmp_path / "bag.mcap")
+    reports, damage, *_ = inspect(tmp_path / "bag.mcap")
     assert [(r.topic.name, r.received) for r in reports] == [("/a", 1)]
     for line, words in zip(
         damage,
@@ -297,7 +297,7 @@ def test_large_and_packed_messages_of_a_database_are_read_in_portions(tmp_path):
     base.execute("UPDATE topics SET type = CAST(x'fffe' AS TEXT) WHERE id = 2")
     base.commit()
     with bounded():
-        _, damage, _ = inspect(path)
+        _, damage, *_ = inspect(path)
     assert "more bytes than it should" in damage[0]
     base.execute(
         "UPDATE messages SET data = zeroblob(70000000) WHERE id = (SELECT MAX(id) FROM messages)"
@@ -306,7 +306,7 @@ def test_large_and_packed_messages_of_a_database_are_read_in_portions(tmp_path):
     base.commit()
     base.close()
     with bounded():
-        _, damage, _ = inspect(path)
+        _, damage, *_ = inspect(path)
     assert "of none or more than 67108864 bytes were left out" in damage[0]
 
 

@@ -164,7 +164,9 @@ def test_what_is_damaged_is_left_out_and_said(
     whole = np.isfinite(values).all(axis=1)
     assert (~whole).sum() <= 2
     np.testing.assert_array_equal(values[whole], z[(stamp[whole] - START) // STEP])
-    assert any(words in line for line in samples.recording.damage.report())
+    found = samples.recording.damage
+    assert any(words in line for line in found.report())
+    assert (found.cut_off, found.lost) == (damage is cut_off, damage is not cut_off)
 
 
 def contents(folder):

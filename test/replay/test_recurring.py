@@ -20,6 +20,7 @@ from fdi_ros.replay.recurring import (
     NoisyTime,
     join_noise,
     join_recurring,
+    with_all_candidates,
 )
 
 UNIT_OF = {
@@ -130,6 +131,25 @@ def test_gyros_and_accelerometers_that_come_and_go_are_one():
     assert len(join_halves(join_recurring([*gyros, single], UNIT_OF), UNIT_OF)) == 1
     # Beside a fault of a single channel it is another one.
     assert len(join_halves([gyros[0], single], UNIT_OF)) == 2
+
+
+@pytest.mark.parametrize(
+    ("one", "channels", "since"),
+    [
+        (episode(6.0, length=0.06, last=("imu_3.z",)), GYROS, 6.0),
+        (episode(6.0, length=9.0, last=("imu_3.z",)), GYROS, 6.0),
+        (episode(6.0, last=("imu_1.z",)), ("imu_1.z", *GYROS), 6.0),
+        (episode(6.0, last=("imu_3.z",), end_s=7.5), ("imu_3.z",), 6.4),
+        (episode(6.0, last=("imu_3.z",), stands=True), ("imu_3.z",), 6.4),
+        (episode(6.0, last=("imu_3.z",), state="FAULTY"), ("imu_3.z",), 6.4),
+    ],
+)
+def test_evidence_that_fades_leaves_no_channel_named(one, channels, since):
+    told = with_all_candidates(one, " or ".join)
+    assert (told.channels, told.since_s) == (channels, since)
+    if told is not one:
+        assert (told.start_s, told.end_s, told.ever) == (6.0, one.end_s, one.ever)
+        assert told.words.startswith(f"{' or '.join(channels)} AMBIGUOUS from 6.000 s")
 
 
 STRETCHES = [

@@ -5,7 +5,7 @@
 
 import json
 import re
-from dataclasses import replace as changed
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +15,10 @@ from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
 from monitor.streams import RATE, body_rate, parallel, stream, swing
+from replay.summaries import summary_of
+from replay.test_recurring import episode
 
+from fdi_ros.bag.samples import StepBack
 from fdi_ros.config.config import Config
 from fdi_ros.config.unit_names import short_names, unit_names
 from fdi_ros.core.states import Reason
@@ -34,9 +37,11 @@ from fdi_ros.monitor.soundness import (
     own_noise,
     word_of,
 )
-from fdi_ros.replay.health import WINDOWS, Deliveries
+from fdi_ros.replay.episodes import Story, join_halves
+from fdi_ros.replay.health import WINDOWS, Deliveries, Holes
+from fdi_ros.replay.outcomes import FaultEffect, Scores
 from fdi_ros.replay.run import Judge, _frozen_when, replay
-from fdi_ros.replay.summary import BiasResult, FarBias
+from fdi_ros.replay.summary import BiasResult, ChannelResult, FarBias
 from fdi_ros.replay.verdict import (
     _other_names,
     _without_brief_sets,
@@ -407,6 +412,341 @@ def test_the_verdict_names_what_is_wrong_and_not_what_was_doubted(
     assert re.match(sentence, out.splitlines()[0]), out
 
 
+def channel_result(name, **changes):
+    """A channel at the end that is fine, but for some changes."""
+    fine = ChannelResult(
+        name=name,
+        unit=name.partition(".")[0],
+        measured_in="m/s^2" if "accel" in name else "rad/s",
+        state="OK",
+        since_s=None,
+        reason="",
+        residual_rms_rad_s=None,
+        noise=None,
+        unchecked=0.0,
+    )
+    return replace(fine, **changes)
+
+
+def judged(channels, *episodes):
+    """The summary of 60 s with some channels and episodes."""
+    scores = Scores(6000, 60.0, (), (), FaultEffect(), 0.0, 6000, 6000, 0, ())
+    summary = summary_of(scores)
+    return replace(
+        summary,
+        monitor=replace(summary.monitor, channels=tuple(channels)),
+        story=Story((), episodes),
+    )
+
+
+NOISY = ("b.x", "b.y", "b.z")
+
+
+@pytest.mark.parametrize(
+    ("candidates", "seconds", "began", "sentence"),
+    [
+        (
+            ["a.z", "b.z"],
+            0.08,
+            None,
+            "LOOK: no fault lasted in 60.0 s, but b had up to 10 times the noise of the other units."
+            " A fault of a set was suspected from 5.0 s, for 80 ms: such noise causes that."
+            " What to do: check b for a loose mounting.",
+        ),
+        (
+            ["a.z", "b.z"],
+            0.08,
+            5.1,
+            "FAULTY: a set (undecided) from 5.0 s, for 80 ms. b had up to 10 times the noise of the"
+            " other units, from 5.1 s on. Do not fly before b is checked for a loose mounting or replaced.",
+        ),
+        (
+            ["a.z", "c.z"],
+            0.08,
+            None,
+            "FAULTY: a set (undecided) from 5.0 s, for 80 ms. b had up to 10 times the noise of the"
+            " other units. Do not fly before a and c are compared at rest and in turns: at least one is faulty.",
+        ),
+        (
+            ["a.z", "b.z"],
+            2.0,
+            None,
+            "FAULTY: a set (undecided) from 5.0 s to 7.0 s. Do not fly before a and b are compared"
+            " at rest and in turns: at least one is faulty.",
+        ),
+    ],
+)
+def test_noise_throughout_explains_brief_sets_of_its_unit(
+    candidates, seconds, began, sentence
+):
+    """No unit beside it is named, and noise that begins is a fault."""
+    channels = [
+        channel_result(
+            f"{unit}.{axis}",
+            own_noise_rad_s=0.03 if unit == "b" else 0.003,
+            noisy_s=20.0 if began and unit == "b" else 0.0,
+            noisy_from_s=began or 0.0,
+        )
+        for unit in "abc"
+        for axis in "xyz"
+    ]
+    summary = judged(channels, episode(5.0, tuple(candidates), seconds))
+    assert verdict_of(summary).sentence == sentence
+
+
+@pytest.mark.parametrize(
+    ("frozen", "who"),
+    [
+        ("accel_", "a, all accelerometers,"),
+        ("", "a, all gyros,"),
+        (None, "a, all axes,"),
+    ],
+)
+def test_only_the_frozen_sensors_of_a_unit_are_named(frozen, who):
+    """Gyros and accelerometers of a unit are often two chips, or two registers of one."""
+    names = [
+        f"{unit}.{half}{axis}"
+        for unit in "abc"
+        for half in ("", "accel_")
+        for axis in "xyz"
+    ]
+    struck = [
+        name
+        for name in names
+        if name[0] == "a" and (frozen is None or ("accel" in name) == bool(frozen))
+    ]
+    why = Reason.FROZEN.value
+    channels = [
+        channel_result(name, reason=why if name in struck else "") for name in names
+    ]
+    halves = [
+        episode(22.0, own, stands=True)
+        for own in (
+            tuple(name for name in struck if ("accel" in name) == is_force)
+            for is_force in (False, True)
+        )
+        if own
+    ]
+    unit_of = {name: name[0] for name in names}
+    (one,) = join_halves(halves, unit_of)
+    first = verdict_of(judged(channels, one)).sentence
+    assert first == (
+        f"FAULTY: {who} from 22.0 s. Reason: {why}. Do not fly before a is checked or replaced."
+    )
+
+
+@pytest.mark.parametrize("cut", [1, 7, 5000])
+@pytest.mark.parametrize("rate", [2.0, 50.0])
+def test_times_without_samples_are_found_however_blocks_are_cut(rate, cut):
+    time = np.arange(0.0, 60.0, 1 / rate)
+    time = time[((time < 20.0) | (time > 29.3)) & ((time < 40.0) | (time > 40.4))]
+    stamp = START + np.round(time * 1e9).astype(np.int64)
+    found = Holes()
+    for first in range(0, len(stamp), cut):
+        found.add(stamp[first : first + cut])
+    ((begin, end),) = found.found
+    assert (begin - START) * 1e-9 == pytest.approx(20.0, abs=1 / rate + 1e-6)
+    assert (end - START) * 1e-9 == pytest.approx(29.3, abs=1 / rate + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("stream", "said"),
+    [
+        ({}, []),
+        ({"holes": ((20.0, 32.0),)}, []),
+        (
+            {"holes": ((20.0, 29.3),)},
+            ["the recording lacks 9.3 s of all units, from 20.0 s to 29.3 s"],
+        ),
+        (
+            {"lost": True, "holes": ((20.0, 32.0), (40.0, 41.5))},
+            [
+                "the recording is damaged and lacks 13.5 s of all units, in 2 parts, the first"
+                " from 20.0 s to 32.0 s"
+            ],
+        ),
+        (
+            {"lost": True},
+            [
+                "the recording is damaged: some messages are missing, at its end or between"
+            ],
+        ),
+        ({"cut_off": True}, []),
+    ],
+)
+def test_a_recording_that_is_not_whole_is_not_healthy(stream, said):
+    """What no unit delivered was not checked, and hides no fault."""
+    summary = judged([channel_result("a.x")])
+    summary = replace(summary, stream=replace(summary.stream, **stream))
+    assert list(map(str, summary.concerns)) == said
+    word, sentence, _ = verdict_of(summary)
+    assert word == ("LOOK" if said else "HEALTHY")
+    cut_off = "no fault was found in 60.0 s, where the recording is cut off; 1 channel"
+    assert (cut_off in sentence) == ("cut_off" in stream)
+
+
+def test_values_that_repeat_for_long_are_said_as_inspect_says_them():
+    """What repeats is not checked, also if more than half of the flight was."""
+    repeats = [channel_result(f"{unit}.accel_x", repeated=0.24) for unit in "ab"]
+    fine = [channel_result("c.accel_x", repeated=0.09), channel_result("a.x")]
+    verdict = verdict_of(judged([*repeats, *fine]))
+    assert verdict.word == "LOOK"
+    assert (
+        "a.accel_x and b.accel_x repeated one value for long, in 24 % of the samples."
+        " What to do: check the driver of a and b if the vehicle moved meanwhile"
+    ) in verdict.sentence
+    set_of_them = episode(5.0, ("a.accel_x", "b.accel_x"), stands=True)
+    assert not judged([*repeats, *fine], set_of_them).concerns
+
+
+COUNTERS = ("received", "duplicate", "backward", "jumped", "late", "missing")
+
+
+@pytest.mark.parametrize(
+    ("counts", "back", "said"),
+    [
+        ({}, None, ""),
+        ({"jumped": 10}, None, ""),
+        ({"received": 4000, "missing": 2000}, None, ""),
+        (
+            {"jumped": 3000, "missing": 3000},
+            None,
+            "has stamps far ahead of those of the other units in 50 % of its messages: these were not used",
+        ),
+        (
+            {"duplicate": 3000},
+            None,
+            "repeats old stamps in 50 % of its messages: these were not used",
+        ),
+        (
+            {"duplicate": 1, "backward": 1},
+            (18.0, 0.04),
+            "has stamps that go back by 0.04 s at 18.0 s, as if its clock was set",
+        ),
+        (
+            {"missing": 730},
+            None,
+            "has stamps so irregular that 12 % of the samples lack its value, though its messages came",
+        ),
+    ],
+)
+def test_wrong_stamps_of_a_unit_are_its_trouble_and_not_connection_or_mounting(
+    counts, back, said
+):
+    counters = {
+        f"/{unit}": {**dict.fromkeys(COUNTERS, 0), "received": 6000} for unit in "abc"
+    }
+    counters["/b"] |= counts
+    channels = [
+        channel_result(
+            f"{unit}.{axis}",
+            delivered=0.5 if unit == "b" else 1.0,
+            own_noise_rad_s=0.03 if unit == "b" else 0.003,
+        )
+        for unit in "abc"
+        for axis in "xyz"
+    ]
+    loose = replace(episode(18.0, NOISY, stands=True), sets=5)
+    any_of_them = episode(18.0, ("a.x", "b.x", "c.x"), stands=True)
+    for episodes in ((), (loose,), (any_of_them,)):
+        summary = judged(channels, *episodes)
+        units = tuple(UnitHealth(name=unit, topic=f"/{unit}") for unit in "abc")
+        stream = replace(
+            summary.stream,
+            alignment=counters,
+            steps_back={} if back is None else {"/b": back},
+        )
+        monitor = replace(summary.monitor, units=units)
+        found = verdict_of(replace(summary, monitor=monitor, stream=stream)).sentence
+        if said:
+            assert f"b {said}" in found
+            assert "connection" not in found
+            assert "loose" not in found.replace("only then check it for a loose", "")
+            work = "before b is checked, first the stamps of its driver, or replaced"
+            assert (work in found) == bool(episodes)
+        else:
+            assert ("connection" in found) == (not episodes)
+            assert ("loose" in found) == (any_of_them not in episodes)
+
+
+def test_stamps_of_all_units_that_repeat_are_the_reason_for_no_verdict():
+    """Not too short a recording: none of its stamps is a time."""
+    units = tuple(UnitHealth(name=unit, topic=f"/{unit}") for unit in "ab")
+    counters = dict.fromkeys(COUNTERS, 0) | {"received": 2000, "duplicate": 1999}
+    summary = judged([channel_result("a.x"), channel_result("b.x")])
+    bias = replace(summary.monitor.bias, state="learning")
+    summary = replace(
+        summary,
+        scores=replace(summary.scores, samples=1, samples_judged=0),
+        monitor=replace(summary.monitor, units=units, bias=bias),
+        stream=replace(summary.stream, alignment={"/a": counters, "/b": counters}),
+    )
+    assert verdict_of(summary).sentence == (
+        "CANNOT TELL: none of 1 samples was judged. a and b repeat old stamps in 99.95 % of their"
+        " messages: these were not used. What to do: check the driver of a and b: every message"
+        " needs the time of its measurement."
+    )
+
+
+def late(delay, std=0.004):
+    return UnitHealth(
+        name="b", topic="/b", delay_s=delay, delay_std_s=std, delay_to="a"
+    )
+
+
+@pytest.mark.parametrize(
+    ("delay", "words"),
+    [
+        (0.067, "its stamps are 67 ms late against those of a, which looks like noise"),
+        (-0.034, "its stamps are 34 ms early against those of a"),
+        (0.002, ""),
+        (0.011, ""),
+    ],
+)
+def test_noise_of_a_late_unit_is_by_its_delay(delay, words):
+    noise = {"a": 0.003, "b": 0.03, "c": 0.003}
+    some = [
+        ChannelHealth(name=f"{unit}.x", unit=unit, own_noise_rad_s=one)
+        for unit, one in noise.items()
+    ]
+    (one,) = concerns_of(some, [late(delay)])
+    assert words in str(one)
+    assert ("delay" in one.advice) == bool(words)
+
+
+@pytest.mark.parametrize("cut", [1, 3, 1000])
+@pytest.mark.parametrize(
+    ("stamp", "back"),
+    [
+        (np.arange(0, 400, 20), 0),
+        # A clock is set back; messages come twice; one is overtaken.
+        (np.r_[0:400:20, 360:800:20], 20),
+        (np.r_[0:400:20, 40:800:20], 340),
+        (np.repeat(np.arange(0, 400, 20), 2), 0),
+        (np.repeat(np.arange(0, 400, 20), 3), 0),
+        (np.r_[0:200:20, 220, 200, 240:400:20], 0),
+    ],
+)
+def test_a_clock_that_is_set_back_is_no_message_that_was_overtaken(stamp, back, cut):
+    found = StepBack()
+    for first in range(0, len(stamp), cut):
+        found.add(stamp[first : first + cut])
+    assert found.largest == back
+    assert found.first == (380 if back else None)
+
+
+def test_inspect_says_that_a_recording_is_damaged(fdi, tmp_path):
+    time = np.arange(0.0, 14.0, 0.02)
+    rates = np.random.default_rng(2).normal(0.0, 0.003, (len(time), 6))
+    stamp = START + np.round(time * 1e9).astype(np.int64)
+    bag = write_mcap(tmp_path / "bag.mcap", imu_messages(stamp, rates))
+    data = bytearray(bag.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 4000] = bytes(4000)
+    bag.write_bytes(data)
+    first = fdi("inspect", bag).out.splitlines()[0]
+    assert first.startswith("READY, BUT LOOK: the recording is damaged")
+
+
 def test_other_faults_are_told_apart_though_their_words_have_commas():
     gyros = "one of the gyros (all but imu_1.x, imu_2.y and imu_3.y)"
     axis = "the z axis of imu_1, imu_2 or imu_3"
@@ -627,7 +967,7 @@ def test_a_rate_that_is_missing_says_that_all_units_repeated_one_value():
     units = _frozen_when(monitor, SimpleNamespace(episodes=episodes))
     assert units == ("imu_0", "imu_1", "imu_2")
     assert _frozen_when(monitor, SimpleNamespace(episodes=episodes[1:])) == ()
-    (missing,) = concerns_of([], rate=changed(rate, frozen=units))
+    (missing,) = concerns_of([], rate=replace(rate, frozen=units))
     assert missing.words.endswith("when imu_0, imu_1 and imu_2 repeated one value")
     assert missing.advice.startswith("check the driver of imu_0, imu_1 and imu_2 if")
     # One that goes on measuring is another cause.

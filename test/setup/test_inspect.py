@@ -21,7 +21,7 @@ from bag.recordings import (
 
 from fdi_ros.bag.samples import read_block
 from fdi_ros.config.config import Config
-from fdi_ros.inspection.fitness import NEEDED, candidates
+from fdi_ros.inspection.fitness import NEEDED, candidates, message_findings, needs
 from fdi_ros.inspection.starting_config import starting_config, starting_config_of
 from fdi_ros.inspection.topics import inspect, recording_text, topics_text
 from fdi_ros.monitor.pipeline import Pipeline
@@ -31,7 +31,7 @@ def test_rates_gaps_and_noise_are_found(tmp_path):
     messages, _ = flight(2000)
     gap = range(START + 500 * STEP, START + 540 * STEP)
     kept = [m for m in messages if m[0] == TOPICS[0] or m[1] not in gap]
-    reports, damage, _ = inspect(write_mcap(tmp_path / "bag.mcap", kept))
+    reports, damage, *_ = inspect(write_mcap(tmp_path / "bag.mcap", kept))
     first, second = reports
     assert damage == ()
     assert (first.received, first.gaps, second.received, second.gaps) == (
@@ -143,7 +143,7 @@ def test_malformed_messages_and_stamps_that_go_back_are_said(tmp_path):
         messages += [
             (TOPICS[0], messages[-1][1] + STEP, imu(messages[-1][1] + STEP, rate))
         ]
-    reports, damage, _ = inspect(write_mcap(tmp_path / "bag.mcap", messages))
+    reports, damage, *_ = inspect(write_mcap(tmp_path / "bag.mcap", messages))
     assert [report.repeats.count.tolist() for report in reports] == [
         [150, 0, 200],
         [0, 0, 0],
@@ -217,7 +217,7 @@ def test_noise_in_motion_is_told_apart_from_that_at_rest_of_each_unit_and_writte
     z += np.random.default_rng(1).normal(0, [0.002] * 3 + [0.004] * 3, (3000, 6))
     z[5, 0] = np.nan
     messages = imu_messages(START + STEP * k[:, 0], z)
-    reports, damage, _ = inspect(write_mcap(tmp_path / "bag.mcap", messages))
+    reports, damage, *_ = inspect(write_mcap(tmp_path / "bag.mcap", messages))
     for report, quiet in zip(reports, (0.002, 0.004), strict=True):
         np.testing.assert_allclose(report.segments.noise().quiet, quiet, rtol=0.2)
         np.testing.assert_allclose(
@@ -339,3 +339,86 @@ def test_a_spike_does_not_raise_the_range_but_a_fast_turn_does(
     path = write_mcap(tmp_path / "bag.mcap", imu_messages(stamp, z, TOPICS[:2]))
     (found,) = starting_config_of(path, "refused").parameters["health.max_rate"]
     assert found == limit
+
+
+def stamped(rate, strike):
+    """Messages of two units at rest; `strike(stamps)` gives the stamps of the second one."""
+    time = START + np.round(np.arange(0.0, 300 / rate, 1 / rate) * 1e9).astype(np.int64)
+    random = np.random.default_rng(4)
+    messages = []
+    for topic, stamps in (("/a/imu", time), ("/b/imu", strike(time))):
+        for log, at in zip(time.tolist(), stamps.tolist(), strict=True):
+            values = random.normal(0.0, 0.003, 3)
+            messages.append((topic, log, imu(at, values)))
+    return sorted(messages, key=lambda one: one[1])
+
+
+@pytest.mark.parametrize("rate", [20.0, 400.0])
+@pytest.mark.parametrize(
+    ("strike", "words"),
+    [
+        (lambda time: time * 0 + START, "its stamps do not increase in 99.7 % of"),
+        (lambda time: time // 1000, "about 1000 times closer together"),
+        (lambda time: time // 10**6, "about 1000000 times closer together"),
+        (lambda time: START // 100 + time % 10**12 * 1000, "1000 times farther apart"),
+        (lambda time: START + (time - START) // 3, ""),
+    ],
+)
+def test_stamps_that_are_no_times_are_told(rate, strike, words, tmp_path):
+    """The clock of a simulation may be some times slower."""
+    found = inspect(write_mcap(tmp_path / "bag.mcap", stamped(rate, strike))).reports
+    assert words in needs(found)
+    assert bool(needs(found)) == bool(words)
+
+
+def test_messages_that_come_twice_are_no_burst(tmp_path):
+    """Their stamps show when the unit measured, and their noise and rate are those of one."""
+    once = stamped(50.0, lambda time: time)
+    twice = [
+        one
+        for topic, log, data in once
+        for one in [(topic, log, data), (topic, log + 1000, data)][
+            : 1 + (topic == "/b/imu")
+        ]
+    ]
+    first, second = inspect(write_mcap(tmp_path / "bag.mcap", twice)).reports
+    assert (second.received, second.again, second.burst) == (600, 300, 1)
+    assert second.rate == pytest.approx(50.0, rel=0.01)
+    ratio = second.segments.noise().quiet / first.segments.noise().quiet
+    assert ratio == pytest.approx(1.0, abs=0.3)
+    assert candidates([first, second]) == [first, second]
+
+
+@pytest.mark.parametrize("size", [3.5, -3.5, 86400.0])
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_clock_that_jumps_against_another_unit_is_told(size, alone, tmp_path):
+    """Stamps that go back are told as such; what all units share is of another clock."""
+
+    def jump(time):
+        return time + np.where(time - START > 3 * 10**9, int(size * 1e9), 0)
+
+    messages = stamped(50.0, jump)
+    if not alone:
+        messages = [(topic, log, data) for topic, log, data in messages if "b" in topic]
+        messages += [("/a/imu", log, data) for _, log, data in messages]
+        messages.sort(key=lambda one: one[1])
+    found = inspect(write_mcap(tmp_path / "bag.mcap", messages)).reports
+    words = " ".join(one.words for one in message_findings(found))
+    told = f"the stamps of /b/imu advance by {abs(size):g} s more than the time of"
+    assert (told in words) == (alone and size > 0)
+    assert ("go back" in words) == (size < 0)
+
+
+@pytest.mark.parametrize(("seconds", "short"), [(2.0, True), (5.0, True), (7.0, False)])
+def test_inspect_asks_for_a_look_where_a_replay_cannot_tell(
+    seconds, short, fdi, tmp_path
+):
+    time = START + np.round(np.arange(0.0, seconds, 0.02) * 1e9).astype(np.int64)
+    rates = np.random.default_rng(3).normal(0.0, 0.003, (len(time), 6))
+    path = write_mcap(tmp_path / "bag.mcap", imu_messages(time, rates))
+    first = fdi("inspect", path).out.splitlines()[0]
+    assert first.startswith("READY, BUT LOOK: the recording lasts") == short
+    rates[len(rates) // 2 :, 4] = np.nan
+    path = write_mcap(tmp_path / "nan.mcap", imu_messages(time, rates))
+    first = fdi("inspect", path).out.splitlines()[0]
+    assert "gave no finite value in 50 % of the messages: y" in first
