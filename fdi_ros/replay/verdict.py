@@ -68,13 +68,13 @@ def verdict_of(judgement: Judgement, unit: Unit = RADIANS) -> ReplayVerdict:
     word = word_of(concerns)
     deciding = [one for one in concerns if one.word is word or one.trouble in _OF_TIME]
     names = dict.fromkeys(name for one in deciding for name in one.who)
-    seconds = judgement.scores.duration_s
     if word is Word.HEALTHY:
         sentence = _healthy_words(judgement)
     else:
         listed_ones = first_of(list(map(str, deciding)), REPORTED.concerns, "; ")
         found = "lasted" if explained else "was found"
-        sentence = f"no fault {found} in {seconds:.1f} s, but {listed_ones}."
+        time = _recorded_words(judgement)
+        sentence = f"no fault {found} in {time}, but {listed_ones}."
         if explained:
             sentence += f" {_doubted_words(faulty)}"
         sentence += f" What to do: {advice_on(deciding)}"
@@ -195,6 +195,16 @@ def _verdict_on_faults(judgement: Judgement) -> ReplayVerdict:
     return ReplayVerdict(word, score, tuple(names))
 
 
+def _recorded_words(judgement: Judgement) -> str:
+    """Return how long the recording is without its long gaps, such as 40.0 s."""
+    gaps = judgement.story.gaps
+    between = sum(end - begin for begin, end in gaps)
+    words = f"{judgement.scores.duration_s - between:.1f} s"
+    if gaps:
+        words += f" (in {len(gaps) + 1} parts, with {between:.1f} s between them)"
+    return words
+
+
 def _healthy_words(judgement: Judgement) -> str:
     channels = judgement.monitor.channels
     checked = min((one.checked for one in channels), default=1.0)
@@ -212,7 +222,7 @@ def _healthy_words(judgement: Judgement) -> str:
     more = f"; not checked at the end: {listed(end)}" if end else ""
     until = ", where the recording is cut off" if judgement.is_cut_off else ""
     return (
-        f"no fault was found in {judgement.scores.duration_s:.1f} s{until};"
+        f"no fault was found in {_recorded_words(judgement)}{until};"
         f" {len(channels)} channels, {share}{more}"
     )
 

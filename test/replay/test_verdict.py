@@ -302,6 +302,21 @@ def test_a_fault_is_one_plain_sentence(fault, sentence, fdi, tmp_path):
     assert advice == "before imu_1 is checked or replaced."
 
 
+def test_the_time_between_the_parts_of_a_recording_counts_as_none(fdi, tmp_path):
+    """All clocks are set a day ahead, or two flights are in one recording."""
+    time = np.arange(0, 20, 0.02)
+    time[500:] += 86400.0
+    random = np.random.default_rng(8)
+    turn = 0.5 * np.sin(np.outer(np.arange(0, 20, 0.02), (0.7, 1, 2)))
+    rates = [turn + random.normal(0, 0.003, turn.shape) for _ in range(3)]
+    head = ",".join(["time", *(name.replace(".", "_") for name in UNITS)])
+    path = tmp_path / "day.csv"
+    table = np.column_stack([time, *rates])
+    np.savetxt(path, table, "%.7f", delimiter=",", header=head, comments="")
+    first = fdi("replay", path).out.splitlines()[0]
+    assert " in 20.0 s (in 2 parts, with 86400.0 s between them)" in first
+
+
 def residuals(noise, axes):
     """Differences of 4000 samples with some noise from the least-squares rate."""
     random = np.random.default_rng(6)
