@@ -74,6 +74,7 @@ class Flight:
         self.primary = 0  # EKF lane that the vehicle flies with
         self.lane_changed = 0  # when it changed, or the vehicle was disarmed, ns
         self.lane_misled = -NS  # when we last took the IMU of this lane out, ns
+        self.ran_on = [-NS for _ in every]  # when this lane last ran on each IMU, ns
         # The policy's view.
         self.named = [False for _ in every]
         self.agreed: list[int | None] = [0 for _ in every]
@@ -120,7 +121,9 @@ class Flight:
         """A PARAM_SET has arrived."""
         if by == OTHERS and self.use[k] and not use:
             self.taken_by_others = self.now
-        if by == OURS and not use and k == self.source:
+        # Its own IMU may have come back just before.
+        trip = FRESH + LATE_ANSWER + 2 * self.slow
+        if by == OURS and not use and self.now - self.ran_on[k] <= trip:
             self.lane_misled = self.now
         self.use[k] = use
         self.by[k] = by
@@ -140,6 +143,7 @@ class Flight:
         self.primary = lane
         self.lane_changed = self.now
         self.lane_misled = -NS
+        self.ran_on = [-NS] * self.count
 
         def arrive() -> None:
             self.lane_named = lane
@@ -234,6 +238,8 @@ class Flight:
 
     def step(self) -> None:
         self.now += STEP
+        if self.source >= 0:
+            self.ran_on[self.source] = self.now
         if not self.now // STEP % 40 and self.linked:
             self.landed = self.now if self.armed else self.landed
             self.disarmed = self.now - self.landed

@@ -45,7 +45,7 @@ from fdi_ros.mavlink.protocol import MS, NS
 ASK_AFTER = (300 * MS, 600 * MS, NS, 2 * NS, 3 * NS, 4 * NS, 5500 * MS)
 TOO_LATE = 6 * NS  #: After this time from the report nothing is asked, ns.
 SCORED = NS  #: A lane that was misled has a high score after this time, ns.
-#: For this time, ns, a lane that a text has named may be newer than the heartbeat "disarmed".
+#: For this time, ns, a text may be newer than the last heartbeat.
 HEARTBEAT_AGE = 2 * NS
 
 
@@ -65,7 +65,7 @@ class LaneState(NamedTuple):
 
     #: Lane that the autopilot flies with. None: unknown.
     primary: int | None = None
-    named_at: int = LONG_AGO  #: When a text last named it, before a heartbeat "armed".
+    named_at: int = LONG_AGO  #: When a text last named a lane while disarmed.
     source: int | None = None  #: IMU, from 0, that this lane runs on. None: unknown.
     #: When the IMU that this lane ran on was reported out by our order. None: it was not.
     out_at: int | None = None
@@ -113,15 +113,16 @@ def follow(
 def _primary(state: LaneState, report: LaneReport, view: View, now: int) -> int | None:
     """Return the lane that the autopilot flies with. None: unknown.
 
-    While disarmed ArduPilot returns to the lane of EK3_PRIMARY.
+    While disarmed ArduPilot returns to the lane of EK3_PRIMARY. A text that comes then is of the
+    landing, or of an arming whose heartbeat is still to come.
     """
-    if report.named is not None:
+    if report.named is not None and view.armed:
         return report.named if report.named < report.lanes else None
     if not report.is_complete:
         return None
-    if view.armed or now - state.named_at < HEARTBEAT_AGE:
+    if view.armed:
         return state.primary
-    if report.configured is None:
+    if report.configured is None or now - state.named_at < HEARTBEAT_AGE:
         return None
     return report.configured if report.configured < report.lanes else 0
 
