@@ -312,6 +312,7 @@ def failover(trials: int, seed: int) -> None:
     values += (f"failover_file:={file}",)
     words = [f"mavlink_node:{value}" for value in values]
     times: dict[str, list[float]] = {name: [] for name in (*map(str, SIZES), "unit")}
+    used = autopilot.parameters
     wrong = 0
     with (
         OverUdp(port, autopilot),
@@ -340,7 +341,6 @@ def failover(trials: int, seed: int) -> None:
             ]
             fault[:] = 0.0
             autopilot.armed = False
-            used = autopilot.parameters
             assert wait(lambda: all(used[one] for one in PARAMETERS), 60.0), "stays out"
     for name, found in times.items():
         print(
