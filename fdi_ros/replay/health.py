@@ -262,7 +262,7 @@ def with_context(unit: UnitHealth, context: FlightContext) -> UnitHealth:
 
 
 class Usual(NamedTuple):
-    """What is usual for the errors of a channel."""
+    """Usual errors of a channel."""
 
     noise: float
     """Standard deviation, without what follows the rate, rad/s. NaN: not measured."""
@@ -347,7 +347,7 @@ class UsualNoise:
                 self._begin = None
 
     def result(self) -> list[Usual]:
-        """Return what is usual for each channel."""
+        """Return the usual errors of each channel."""
         if not self._noise:
             return [Usual(math.nan) for _ in self._axes]
         noise = np.array(self._noise)
@@ -374,7 +374,7 @@ def _moments(residual: Array, along: Array) -> Array:
 
 
 def _usual(noise: Array, moments: Array) -> Usual:
-    """Return what is usual for a channel with noise (k,) and moments (k, 3) in k windows."""
+    """Return the usual errors of a channel with noise (k,) and moments (k, 3) in k windows."""
     measured = np.isfinite(noise)
     if measured.sum() < LEAST_USUAL_WINDOWS:
         return Usual(math.nan)

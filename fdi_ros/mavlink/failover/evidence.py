@@ -9,7 +9,7 @@ comparison does neither and shows the present difference of the autopilot's own 
 `Evidence.look` lists the steps. Each rule of docs/failover.md has a module:
 
 =====================  ==================================================================
-`failover.records`     what is remembered of an IMU, and the present comparison of all
+`failover.records`     memory of each IMU, and the present comparison of all
 `failover.apart`       how far two IMUs are apart
 `failover.off`         whether an IMU is off
 `failover.moves`       which axes move

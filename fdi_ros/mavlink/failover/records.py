@@ -1,9 +1,9 @@
 # Copyright 2026 fdi_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Records on which the rules of failover judge: what is remembered, and the present comparison.
+"""Records on which the rules of failover judge: the memory, and the present comparison.
 
-`Track` is what is remembered of one IMU. `Present` is the comparison of all IMUs at one time:
+`Track` is the memory of one IMU. `Present` is the comparison of all IMUs at one time:
 rules read it and change nothing in it. Functions named ``note_...`` write into tracks.
 
 docs/failover.md, "Words", has *doubt*. "When an IMU is bad" has *named for this difference*: the
@@ -72,7 +72,7 @@ NO_PARTNERS = Partners()
 
 @dataclass
 class Track:
-    """What is remembered of one IMU. Times in ns."""
+    """Memory of one IMU. Times in ns."""
 
     #: States of its three channels. Empty: unknown.
     states: tuple[ChannelState, ...] = ()
@@ -177,7 +177,7 @@ class Present(NamedTuple):
     pairs: Mapping[Pair, Compared]
     #: The smallest steady difference of each pair within 50 ms, by axis, rad/s.
     steady: Mapping[Pair, Vector]
-    tracks: Sequence[Track]  #: What is remembered of each IMU.
+    tracks: Sequence[Track]  #: Memory of each IMU.
 
     @property
     def both_errors(self) -> float:
