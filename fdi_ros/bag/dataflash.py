@@ -271,8 +271,15 @@ class DataflashLog(FlightLog):
             yield samples, offset / self.end
             if final or not size:
                 break
-        if lost + self.end - offset:
-            self.leave_bytes(lost + self.end - offset)
+        left = lost + self.end - offset - self._erased()
+        if left > 0:
+            self.leave_bytes(left)
+
+    def _erased(self) -> int:
+        """Return the number of bytes of erased flash at the end, at most a portion."""
+        self.file.seek(max(0, self.end - _PORTION_BYTES))
+        end = self.file.read(_PORTION_BYTES)
+        return len(end) - len(end.rstrip(b"\xff"))
 
     def _read(
         self, data: Bytes, begin: int, final: bool

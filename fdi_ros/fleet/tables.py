@@ -347,8 +347,8 @@ class Fleet:
         faults = f"{_count(own['episodes'], 'fault')} declared"
         if declaring:
             faults += f", in {_count(declaring, 'flight')}"
-        faulty = sum(_class_of(row) == "FAULTY" for row in self.looks)
-        if silent := faulty - declaring:
+        faulty = [row for row in self.looks if _class_of(row) == "FAULTY"]
+        if silent := sum(not row["episodes"] for row in faulty):
             faults += f"; in {_count(silent, 'flight')} a unit fell silent for good"
         counts = (
             f"{_count(own['vehicles'], 'vehicle')}; {faults};"

@@ -90,10 +90,19 @@ def candidates(reports: Sequence[TopicReport]) -> list[TopicReport]:
     return []
 
 
+#: Name under which all accelerometers are left out.
+ALL_ACCELERATIONS = "the acceleration of all units"
+
+
 def left_out(reports: Sequence[TopicReport]) -> list[tuple[str, str]]:
-    """Return each topic of gyros that `candidates` leaves out, and why."""
+    """Return each topic of gyros that `candidates` leaves out, and why.
+
+    Accelerations in g or mg are left out altogether: those of the units could not be compared.
+    """
     chosen = candidates(reports)
     found = []
+    if why := in_gravity(chosen):
+        found.append((ALL_ACCELERATIONS, why))
     for report in reports:
         if report in chosen or not chosen or report.kind is not chosen[0].kind:
             continue
@@ -218,7 +227,7 @@ def refuse_unfit(bag: Path, config: Config) -> list[TopicReport]:
     is_judged = config.accelerometers.enabled != "off"
     if is_judged and (words := in_gravity(chosen)):
         raise BagError(
-            f"{bag} needs {words}; mend the driver, or set accelerometers.enabled to off"
+            f"{bag} needs m/s^2: {words}; mend the driver, or set accelerometers.enabled to off"
         )
     if words := one_clock(chosen, config.imus.timeout):
         raise BagError(f"{bag} needs one clock: {words}")
@@ -309,7 +318,7 @@ def needs(reports: Sequence[TopicReport]) -> str:
     Empty if a config can be made.
     """
     if chosen := candidates(reports):
-        return in_degrees(chosen) or in_gravity(chosen) or _in_bursts(chosen)
+        return in_degrees(chosen) or _in_bursts(chosen)
     why = [
         (shown(report.topic.name), _unusable(report))
         for report in reports

@@ -38,18 +38,18 @@ class _InGravity(NamedTuple):
 
 
 def in_gravity(chosen: Sequence[TopicReport]) -> str:
-    """Return why the accelerometers of topics are in g or mg. Empty: nothing shows that."""
+    """Return what shows that accelerometers of topics are in g or mg. Empty: nothing does."""
     found = [one for report in chosen if (one := _in_gravity(report)) is not None]
     if not found:
         return ""
     words = [
-        f"the accelerometers of {listed([one.name for one in found if one.unit == unit])} are in"
-        f" {unit}, they usually show {figures(usual, 3)}, and gravity is 9.81 m/s^2"
+        f"the accelerometers of {listed([one.name for one in found if one.unit == unit])} usually"
+        f" show {figures(usual, 3)}, as in {unit}; gravity is 9.81 m/s^2"
         for unit in UNITS
         if (sizes := [one.size for one in found if one.unit == unit])
         and (usual := float(np.median(sizes)))
     ]
-    return f"m/s^2: {'; '.join(words)}"
+    return "; ".join(words)
 
 
 def _in_gravity(report: TopicReport) -> _InGravity | None:

@@ -28,6 +28,7 @@ from fdi_ros.inspection.fitness import (
     needs,
     one_clock,
 )
+from fdi_ros.inspection.gravity import in_gravity
 from fdi_ros.inspection.topics import (
     BELIEVED,
     INTERVALS,
@@ -210,6 +211,8 @@ def starting_config(
         known |= settings
     else:
         known |= _settings_of_array(chosen[0], urdf)
+    if why := in_gravity(chosen):
+        known["accelerometers.enabled"] = "off", why
     if silent := _longer(chosen, INTERVALS.gap, 60.0):
         known["health.stale_timeout"] = silent, f"the default is {DEFAULT_TIMEOUT:g} s"
     return StartingConfig(

@@ -43,6 +43,9 @@ from fdi_ros.system.text import figures, first_of, listed, percent
 _OF_TIME = (Trouble.CLOCK, Trouble.STAMPS)
 """Kinds of concerns about times. Wrong times make other figures wrong."""
 SILENT_TO_END = 1.0
+#: noise, in ``noise.noise_std``, that the settings do not foresee: channels that are within
+#: their settings differ by less
+UNFORESEEN = 3.0
 """Time to the end for which a channel must be silent or unchecked to be reported, s. A channel with a later
 value delivers to the end."""
 
@@ -377,7 +380,9 @@ def noise_throughout(judgement: Judgement) -> list[Concern]:
 
     Noise of one unit that is larger than that of the others all the time, as of another
     model, brings brief sets about that unit and channels beside it. Noise that began
-    during the recording is a change, and the sets are its first sign.
+    during the recording is a change, and the sets are its first sign. Noise that the settings
+    foresee explains no set, and neither does noise explain sets that come again, or one that
+    ends without a channel of that unit.
     """
     noise = noise_behind(judgement)
     changed = {
@@ -386,10 +391,17 @@ def noise_throughout(judgement: Judgement) -> list[Concern]:
         if one.noisy_s >= REPORTED.noisy_s
     }
     lasting = [one for one in noise if changed.isdisjoint(one.who)]
-    names = {name for one in lasting for name in one.who}
-    if all(names & one.ever for one in faulty_episodes(judgement)):
-        return lasting
-    return []
+    who = {name for one in lasting for name in one.who}
+    names = {
+        one.name
+        for one in judgement.monitor.channels
+        if {one.name, one.unit} & who and (one.noise or 0.0) >= UNFORESEEN
+    }
+    are_explained = all(
+        one.sets == 1 and not one.stands and not names.isdisjoint(one.channels)
+        for one in faulty_episodes(judgement)
+    )
+    return lasting if are_explained else []
 
 
 def _doubted_words(sets: Sequence[Episode]) -> str:

@@ -24,6 +24,7 @@ from fdi_ros.bag.reader import Recording
 from fdi_ros.config.config import Config
 from fdi_ros.core.sources import ImuSource
 from fdi_ros.errors import BagError, FdiError
+from fdi_ros.inspection.topics import inspect
 
 FLU = np.array([1.0, -1.0, -1.0])
 KINDS = {
@@ -184,6 +185,19 @@ def test_a_hole_in_a_log_is_passed_and_its_bytes_are_counted(tmp_path, hole):
         assert len(found[name][0]) >= len(stamp) - 5
     (line,) = [line for line in damage if "belong to no whole record" in line]
     assert len(hole) <= int(line.split(": ")[1].split()[0]) < len(hole) + 2000
+
+
+def test_erased_flash_at_the_end_of_a_log_is_no_damage(tmp_path):
+    path = log(tmp_path, "IMU")
+    with path.open("ab") as file:
+        file.write(b"\xff" * 20_000)
+    found = inspect(path)
+    assert found.incomplete == ""
+    # The last record has none behind it to prove it.
+    assert int(found.damage[0].split(": ")[1].split()[0]) < 100
+    with path.open("ab") as file:
+        file.write(b"\xfe" * 20_000)
+    assert inspect(path).incomplete == "is damaged"
 
 
 def refusal(path):

@@ -458,12 +458,13 @@ NOISY = ("b.x", "b.y", "b.z")
 
 
 @pytest.mark.parametrize(
-    ("candidates", "seconds", "began", "sentence"),
+    ("candidates", "seconds", "began", "noise", "sentence"),
     [
         (
             ["a.z", "b.z"],
             0.08,
             None,
+            10.0,
             "LOOK: no fault lasted in 60.0 s, but b had up to 10 times the noise of the other units."
             " A fault of a set was suspected from 5.0 s, for 80 ms: such noise causes that."
             " What to do: check b for a loose mounting.",
@@ -472,6 +473,7 @@ NOISY = ("b.x", "b.y", "b.z")
             ["a.z", "b.z"],
             0.08,
             5.1,
+            10.0,
             "FAULTY: a set (undecided) from 5.0 s, for 80 ms. b had up to 10 times the noise of the"
             " other units, from 5.1 s on. Do not fly before b is checked for a loose mounting or replaced.",
         ),
@@ -479,26 +481,37 @@ NOISY = ("b.x", "b.y", "b.z")
             ["a.z", "c.z"],
             0.08,
             None,
+            10.0,
             "FAULTY: a set (undecided) from 5.0 s, for 80 ms. b had up to 10 times the noise of the"
             " other units. Do not fly before a and c are compared at rest and in turns: at least one is faulty.",
         ),
         (
             ["a.z", "b.z"],
+            0.08,
+            None,
+            1.0,  # its settings foresee this noise
+            "FAULTY: a set (undecided) from 5.0 s, for 80 ms. b had up to 10 times the noise of the"
+            " other units. Do not fly before b is checked for a loose mounting or replaced.",
+        ),
+        (
+            ["a.z", "b.z"],
             2.0,
             None,
+            10.0,
             "FAULTY: a set (undecided) from 5.0 s to 7.0 s. Do not fly before a and b are compared"
             " at rest and in turns: at least one is faulty.",
         ),
     ],
 )
 def test_noise_throughout_explains_brief_sets_of_its_unit(
-    candidates, seconds, began, sentence
+    candidates, seconds, began, noise, sentence
 ):
     """No unit beside it is named, and noise that begins is a fault."""
     channels = [
         channel_result(
             f"{unit}.{axis}",
             own_noise_rad_s=0.03 if unit == "b" else 0.003,
+            noise=noise if unit == "b" else 1.0,
             noisy_s=20.0 if began and unit == "b" else 0.0,
             noisy_from_s=began or 0.0,
         )
