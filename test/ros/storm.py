@@ -297,10 +297,13 @@ def vehicle(folder: Path) -> Iterator[Vehicle]:
     with (
         OverUdp(port, Autopilot("px4")),
         monitoring(CONFIG, folder, prime=False) as (listener, monitor),
-        running("mavlink_node", STACK, url=f"udpin:127.0.0.1:{port}") as link,
     ):
-        assert listener.says("monitor", "9 of 9 channels healthy")
-        yield Vehicle(listener, monitor, link, port)
+        # A topic with two publishers has a warning, and its channels do not count as healthy.
+        while listener.outputs:
+            listener.destroy_publisher(listener.outputs.pop())
+        with running("mavlink_node", STACK, url=f"udpin:127.0.0.1:{port}") as link:
+            assert listener.says("monitor", "9 of 9 channels healthy")
+            yield Vehicle(listener, monitor, link, port)
 
 
 def weather(over: Vehicle, kind: str, seconds: float, seed: int) -> dict[str, float]:
