@@ -346,6 +346,21 @@ def test_after_a_gap_in_flight_no_lane_is_asked_for_until_one_is_named(
     assert autopilot.lane_asks
 
 
+def test_a_silence_after_which_the_numbers_go_on_may_hide_texts_too(
+    flying: Monitored,
+) -> None:
+    """256 lost messages leave no gap in the sequence numbers."""
+    autopilot = flying.autopilots[0]
+    number = autopilot.mav.seq
+    flying.cut = True
+    flying.run(0.6)
+    autopilot.mav.seq = number
+    flying.cut = False
+    flying.run(6.0).fault(1, 0.5, seconds=5.0)
+    assert flying.in_use == [False, True, True]
+    assert not autopilot.lane_asks
+
+
 @pytest.mark.parametrize("lost", [1, 2])
 def test_two_lost_messages_in_a_row_may_be_the_texts_and_one_is_not(
     flying: Monitored, lost: int
