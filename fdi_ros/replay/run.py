@@ -45,7 +45,7 @@ from fdi_ros.monitor.soundness import (
     checked_share,
 )
 from fdi_ros.monitor.status import UNUSUAL_ERRORS, Status
-from fdi_ros.replay.episodes import EPISODE_TIMES, Story, join_halves, pieces
+from fdi_ros.replay.episodes import EPISODE_TIMES, Episode, Story, join_halves, pieces
 from fdi_ros.replay.health import (
     Deliveries,
     Holes,
@@ -294,16 +294,6 @@ class Judge(Walk):
         end = self._end
         delays = zip(status.units, status.delays, status.delay_std, strict=False)
         levels = (status.protection_level, status.protection_level_after_loss)
-        far = [
-            FarBias(
-                one.name,
-                abs(one.start_bias),
-                UNUSUAL_ERRORS.start_bias * status.turn_on_std(one),
-                one.unit,
-            )
-            for one in status.channels
-            if status.has_implausible_start_bias(one)
-        ]
         channels = tuple(self._channels(end, status))
         monitor = MonitorResult(
             channels=channels,
@@ -312,12 +302,7 @@ class Judge(Walk):
                 DelayResult(unit.name, late, std) for unit, late, std in delays
             ),
             degraded=tuple(self._degraded.values()),
-            bias=BiasResult(
-                status.bias_state,
-                tuple(status.bias),
-                tuple(one.channel for one in far),
-                tuple(far),
-            ),
+            bias=_bias_result(status),
             note=status.note,
             protection_level=ProtectionLevel(
                 *(tuple(map(finite, level)) for level in levels)
@@ -325,6 +310,17 @@ class Judge(Walk):
             us_per_sample=1e6 * self.seconds / max(1, evaluation.samples),
             rate=self._rate_health(),
         )
+        story = self._story(status)
+        rate = replace(monitor.rate, frozen=_frozen_when(monitor, story))
+        return Judgement(
+            status.detector,
+            evaluation.scores(),
+            replace(monitor, rate=rate),
+            story,
+        )
+
+    def _story(self, status: Status) -> Story:
+        """Return the episodes of both halves, with the faults injected into them."""
         units = {
             name: unit
             for half in self.pipeline.halves
@@ -332,29 +328,24 @@ class Judge(Walk):
                 half.geometry.channel_names, half.geometry.unit_of, strict=True
             )
         }
-        stories = [one.story(end) for one in self._recorders]
+        stories = [one.story(self._end) for one in self._recorders]
         story = _joined(stories, units, self._noisy_times(status))
-        episodes = []
-        for one in story.episodes:
-            one = with_all_candidates(one, self._words_for)
-            known = [
-                followed.fault
-                for followed in evaluation.faults
-                if followed.explains(one.start_s, one.ever)
-            ]
-            injected = tuple(f"{fault.kind.name} on {fault.channel}" for fault in known)
-            wrong_to = None
-            if one.declares and not one.stands and one.evidence.reason in BY_VALUES:
-                clean_time = self.pipeline.config.decision.clean_time
-                wrong_to = round(max(one.end_s - clean_time, one.since_s), 9)
-            episodes.append(replace(one, injected=injected, wrong_to_s=wrong_to))
-        rate = replace(monitor.rate, frozen=_frozen_when(monitor, story))
-        return Judgement(
-            status.detector,
-            evaluation.scores(),
-            replace(monitor, rate=rate),
-            replace(story, episodes=tuple(episodes)),
-        )
+        return replace(story, episodes=tuple(map(self._completed, story.episodes)))
+
+    def _completed(self, episode: Episode) -> Episode:
+        """Return an episode with all its candidates, injected faults and last wrong value."""
+        one = with_all_candidates(episode, self._words_for)
+        known = [
+            followed.fault
+            for followed in self.evaluation.faults
+            if followed.explains(one.start_s, one.ever)
+        ]
+        injected = tuple(f"{fault.kind.name} on {fault.channel}" for fault in known)
+        wrong_to = None
+        if one.declares and not one.stands and one.evidence.reason in BY_VALUES:
+            clean_time = self.pipeline.config.decision.clean_time
+            wrong_to = round(max(one.end_s - clean_time, one.since_s), 9)
+        return replace(one, injected=injected, wrong_to_s=wrong_to)
 
     def _words_for(self, names: Sequence[str]) -> str:
         """Return the words for a set of channels of one half."""
@@ -745,6 +736,26 @@ def _stream_result(samples: Samples, settings: Config, judge: Judge) -> StreamRe
         steps_back=_steps_back(samples, judge),
         facts=tuple(samples.recording.damage.facts),
         unused=tuple(samples.recording.damage.left_out),
+    )
+
+
+def _bias_result(status: Status) -> BiasResult:
+    """Return the learned biases, with those that are far from any healthy one."""
+    far = [
+        FarBias(
+            one.name,
+            abs(one.start_bias),
+            UNUSUAL_ERRORS.start_bias * status.turn_on_std(one),
+            one.unit,
+        )
+        for one in status.channels
+        if status.has_implausible_start_bias(one)
+    ]
+    return BiasResult(
+        status.bias_state,
+        tuple(status.bias),
+        tuple(one.channel for one in far),
+        tuple(far),
     )
 
 
